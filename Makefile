@@ -1,0 +1,51 @@
+# Every target works alone in a fresh clone, with nothing but Python 3.10+ and make.
+
+PYTHON ?= python3
+VENV := .venv
+RUN := $(VENV)/bin/python
+# One thread a process: fastest at these sizes, and parallel tests do not fight over cores.
+export OMP_NUM_THREADS ?= 1
+export MUJOCO_GL ?= disabled
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test test-slow lint format types clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+# The stamp is newer than what it was made from, so a second call starts at once.
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "Python 3.10 or newer is needed; name one with PYTHON=...")'
+	$(PYTHON) -m venv $(VENV)
+	@echo "Installing into $(VENV), once; this takes one to three minutes."
+	$(RUN) -m pip install --quiet --disable-pip-version-check -c constraints.txt torch
+	$(RUN) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
+	@touch $@
+
+install: $(VENV)/.installed ## make .venv with everything that is tested
+
+demo: install ## train ECPO, UREX and MENT on the 10,000-armed bandit and compare them
+	$(RUN) sota-implementations/ecpo/ecpo.py --multirun env=bandit loss=ecpo,urex,ment seed=100 \
+		hydra.sweep.dir=runs/demo
+	$(RUN) -m torchrl_ecpo.experiment.compare runs/demo --metric expected_reward \
+		--title "10,000-armed bandit"
+
+test: install ## run every test that takes less than some ten seconds
+	$(RUN) -m pytest -n auto -q
+
+test-slow: install ## run the tests that take longer
+	$(RUN) -m pytest -n auto -q -m slow
+
+lint: install ## check style and formatting
+	$(RUN) -m ruff check .
+	$(RUN) -m ruff format --check .
+
+format: install ## mend style and formatting
+	$(RUN) -m ruff check --fix .
+	$(RUN) -m ruff format .
+
+types: install ## check types
+	$(RUN) -m pyright
+
+clean: ## remove the environment and everything that was generated
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis runs outputs multirun
