@@ -1,0 +1,625 @@
+"""The equations of the paper as pure functions: tensors in, tensors out.
+
+Source of every equation number: Mei, Xiao, Huang, Schuurmans, Müller, *On Principled Entropy
+Exploration in Policy Optimization*, IJCAI 2019.
+
+Shapes
+------
+Every function works along one axis of *samples*, ``sample_dim``: the K trajectories of a group, or
+the M actions drawn at a state (or all actions, where a sum is exact). ``E*`` stands for the shape
+that is left when this axis is taken out: any number of dimensions, also none. So ``[E*, K]`` is a
+tensor with the sample axis inserted at ``sample_dim`` and ``[E*]`` has one number per group.
+Nothing is averaged over ``E*``: the caller decides.
+
+Symbols
+-------
+==================== ================ =====================================================
+argument             symbol           meaning
+==================== ================ =====================================================
+score                r(rho), Q(s, a)  what is to be maximised
+log_prob             log pi_theta     under the policy being trained; carries the gradient
+reference_log_prob   log pi_bar       under the reference policy, which is lifted
+behaviour_log_prob   log beta         under the policy that drew the samples
+tau                  tau >= 0         temperature of the divergence from the reference
+tau_prime            tau' >= 0        temperature of the entropy
+mask                                  True where a sample is real; absent means all are
+==================== ================ =====================================================
+
+Temperatures are floats or 0-d tensors, in the unit of the score. Floats are checked; tensors are
+taken as they are, so that nothing waits for a device. Finite input never gives NaN.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+__all__ = [
+    "Surrogate",
+    "check_temperatures",
+    "effective_sample_size",
+    "lifted_log_weights",
+    "mean_seeking_projection",
+    "ment_surrogate",
+    "mode_seeking_projection",
+    "self_normalised_weights",
+    "soft_value",
+    "soft_value_estimate",
+    "surrogate_reward",
+    "surrogate_reward_estimate",
+    "theorem1_temperatures",
+    "urex_surrogate",
+]
+
+
+class Surrogate(NamedTuple):
+    """A loss whose gradient is an estimator of the paper's, and the weights it gave the samples."""
+
+    loss: Tensor
+    """``[E*]``: differentiate with respect to the parameters behind ``log_prob``."""
+    weights: Tensor
+    """``[E*, K]``, detached: non-negative, summing to one over real samples."""
+
+
+# --------------------------------------------------------------------------------------- the lift
+
+
+def check_temperatures(*, allow_zero: bool = False, **temperatures: float | Tensor) -> None:
+    """Refuse temperatures for which a loss is not defined.
+
+    Args:
+        allow_zero: whether all may be 0 together.
+        temperatures: by name; each must be finite and at least 0, and they must not all be 0.
+            Tensors are not looked at.
+
+    Raises:
+        ValueError: naming the temperature, what came, and the mend.
+
+    Examples:
+        >>> check_temperatures(tau=0.5, tau_prime=0.01)
+        >>> check_temperatures(tau=0.5, tau_prime=-0.01)
+        Traceback (most recent call last):
+            ...
+        ValueError: tau_prime must be a finite number >= 0, got -0.01.
+    """
+    floats = {name: t for name, t in temperatures.items() if not isinstance(t, Tensor)}
+    for name, value in floats.items():
+        if not 0 <= value < math.inf:
+            raise ValueError(f"{name} must be a finite number >= 0, got {value}.")
+    if not allow_zero and len(floats) == len(temperatures) and not any(floats.values()):
+        raise ValueError(
+            f"{' + '.join(temperatures)} must be positive, got 0: without any regularisation the "
+            "lifted policy is a maximum, not a distribution. Set a temperature above 0."
+        )
+
+
+def lifted_log_weights(
+    score: Tensor,
+    reference_log_prob: Tensor,
+    *,
+    tau: float | Tensor,
+    tau_prime: float | Tensor,
+) -> Tensor:
+    r"""Log-weight of the lifted policy relative to the reference: Lemma 1's :math:`\omega`, Eq. 5.
+
+    .. math::
+        \omega = \frac{r(\rho) - \tau' \log \bar\pi(\rho)}{\tau + \tau'},
+        \qquad \bar\pi^*_{\tau,\tau'}(\rho) \propto \bar\pi(\rho) \exp \omega .
+
+    Args:
+        score: ``[...]``, the return of a trajectory or the value of an action.
+        reference_log_prob: ``[...]``, log-probability under the reference policy, in nats.
+        tau: temperature of the divergence from the reference.
+        tau_prime: temperature of the entropy.
+
+    Returns:
+        ``[...]``, unnormalised. Add ``reference_log_prob`` for the lifted log-probability up to a
+        constant (Eq. 5, 8); add ``reference_log_prob - behaviour_log_prob`` where another policy
+        than the reference drew the samples.
+
+    Examples:
+        (1 - 0.25 * -2) / (0.5 + 0.25) = 2 and (0 - 0.25 * -1) / 0.75 = 1/3:
+
+        >>> score, reference = torch.tensor([1.0, 0.0]), torch.tensor([-2.0, -1.0])
+        >>> lifted_log_weights(score, reference, tau=0.5, tau_prime=0.25)
+        tensor([2.0000, 0.3333])
+    """
+    check_temperatures(tau=tau, tau_prime=tau_prime)
+    return _representable((score - tau_prime * reference_log_prob) / (tau + tau_prime))
+
+
+def self_normalised_weights(
+    log_weights: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None
+) -> Tensor:
+    r"""Self-normalised importance weights, the softmax in Eq. 6.
+
+    .. math:: w_k = \frac{\exp \omega_k}{\sum_j \exp \omega_j}
+
+    Args:
+        log_weights: ``[E*, K]``.
+        sample_dim: the axis of the K samples.
+        mask: ``[E*, K]``, True where a sample is real.
+
+    Returns:
+        ``[E*, K]``, summing to one; 0 where masked. A group without a real sample is all zeros.
+
+    Examples:
+        >>> self_normalised_weights(torch.tensor([3.0, 1.0]).log())
+        tensor([0.7500, 0.2500])
+        >>> self_normalised_weights(torch.zeros(3), mask=torch.tensor([True, True, False]))
+        tensor([0.5000, 0.5000, 0.0000])
+    """
+    if mask is None:
+        return log_weights.softmax(sample_dim)
+    return log_weights.where(mask, _lowest(log_weights)).softmax(sample_dim).where(mask, 0.0)
+
+
+def effective_sample_size(weights: Tensor, *, sample_dim: int = -1) -> Tensor:
+    r"""Kish's effective sample size (Owen 2013, section 9.3), the spread of importance weights.
+
+    .. math:: \mathrm{ESS} = \frac{(\sum_k w_k)^2}{\sum_k w_k^2}
+
+    Args:
+        weights: ``[E*, K]``, non-negative, normalised or not.
+        sample_dim: the axis of the K samples.
+
+    Returns:
+        ``[E*]``, from 1 (one sample has all the weight) to K (all are equal); 0 for a group
+        without weight.
+
+    Examples:
+        1 / (0.75**2 + 0.25**2) = 1.6:
+
+        >>> effective_sample_size(torch.tensor([0.75, 0.25]))
+        tensor(1.6000)
+    """
+    # Scaled by the largest weight, so that no square under- or overflows.
+    scaled = weights / weights.amax(sample_dim, keepdim=True).clamp_min(_tiny(weights))
+    squares = scaled.square().sum(sample_dim)
+    return scaled.sum(sample_dim).square() / squares.clamp_min(_tiny(weights))
+
+
+# -------------------------------------------------------------------------------- the projections
+
+
+def mean_seeking_projection(
+    log_prob: Tensor,
+    log_weights: Tensor,
+    *,
+    control_log_prob: Tensor | None = None,
+    sample_dim: int = -1,
+    mask: Tensor | None = None,
+) -> Surrogate:
+    r"""Project by the mean-seeking KL(target, pi): ECPO's gradient, Lemma 1, Eq. 6.
+
+    .. math::
+        L(\theta) = -\sum_k w_k \log \pi_\theta(\rho_k),
+        \qquad w = \mathrm{softmax}_k(\omega_k)
+
+    Args:
+        log_prob: ``[E*, K]``, log-probability of each sample under the policy being trained.
+        log_weights: ``[E*, K]``, log importance weights of the target relative to the policy that
+            drew the samples: :func:`lifted_log_weights`, plus
+            ``reference_log_prob - behaviour_log_prob`` for data of another policy.
+        control_log_prob: ``[E*, K]``, log-probability under the policy that drew the samples. If
+            given, the self-normalised ratio softmax_k(log_prob - control_log_prob) is subtracted
+            from each weight: a control variate whose expectation tends to zero, which removes the
+            drift of groups in which all weights are equal. Not in the paper; ours.
+        sample_dim: the axis of the K samples.
+        mask: ``[E*, K]``, True where a sample is real.
+
+    Returns:
+        :class:`Surrogate`: its loss ``[E*]`` is the cross-entropy to the target (minus that to the
+        policy itself, with the control variate); its weights are w.
+
+    Examples:
+        Weights 3/4 and 1/4; 0.75 * 2 + 0.25 * 1 = 1.75:
+
+        >>> log_prob = torch.tensor([-2.0, -1.0], requires_grad=True)
+        >>> loss, weights = mean_seeking_projection(log_prob, torch.tensor([3.0, 1.0]).log())
+        >>> loss.backward(); loss.detach(), log_prob.grad
+        (tensor(1.7500), tensor([-0.7500, -0.2500]))
+    """
+    weights = self_normalised_weights(log_weights.detach(), sample_dim=sample_dim, mask=mask)
+    coefficients = weights
+    if control_log_prob is not None:
+        log_ratio = (log_prob - control_log_prob).detach()
+        coefficients = weights - self_normalised_weights(
+            log_ratio, sample_dim=sample_dim, mask=mask
+        )
+    return Surrogate(-_weighted_sum(coefficients, log_prob, sample_dim, mask), weights)
+
+
+def mode_seeking_projection(
+    log_prob: Tensor,
+    reference_log_prob: Tensor,
+    log_weights: Tensor,
+    *,
+    behaviour_log_prob: Tensor | None = None,
+    sample_dim: int = -1,
+    mask: Tensor | None = None,
+) -> Surrogate:
+    r"""Project by the mode-seeking KL(pi, target): PMD's gradient, Eq. 3 and footnote 1.
+
+    By self-normalised importance sampling, with the score-function gradient centred:
+
+    .. math::
+        L(\theta) = -\sum_k v_k (A_k - \bar A) \log \pi_\theta(\rho_k), \quad
+        v = \mathrm{softmax}_k \log\frac{\pi_\theta}{\beta}, \quad
+        A_k = \omega_k - \log\frac{\pi_\theta(\rho_k)}{\bar\pi(\rho_k)}, \quad
+        \bar A = \sum_k v_k A_k
+
+    with v and A held constant. (tau + tau') A is the familiar
+    r - tau (log pi - log pi_bar) - tau' log pi, so at pi = pi_bar and tau' = 0 this is REINFORCE
+    with the group's mean as baseline, divided by tau.
+
+    Args:
+        log_prob: ``[E*, K]``, log-probability of each sample under the policy being trained.
+        reference_log_prob: ``[E*, K]``, under the reference policy.
+        log_weights: ``[E*, K]``, :func:`lifted_log_weights`: of the target relative to the
+            *reference*, whoever drew the samples.
+        behaviour_log_prob: ``[E*, K]``, under the policy that drew the samples; the reference by
+            default.
+        sample_dim: the axis of the K samples.
+        mask: ``[E*, K]``, True where a sample is real.
+
+    Returns:
+        :class:`Surrogate`: a loss ``[E*]`` whose gradient estimates that of KL(pi, target), but
+        whose value does not; its weights are v.
+
+    Examples:
+        At pi = pi_bar the ratios are equal, and the weights 1 and 0 give A - mean = +-1/2:
+
+        >>> log_prob = torch.tensor([-2.0, -1.0], requires_grad=True)
+        >>> loss, v = mode_seeking_projection(log_prob, log_prob.detach(), torch.tensor([1.0, 0.0]))
+        >>> loss.backward(); v, log_prob.grad
+        (tensor([0.5000, 0.5000]), tensor([-0.2500,  0.2500]))
+    """
+    if behaviour_log_prob is None:
+        behaviour_log_prob = reference_log_prob
+    current = log_prob.detach()
+    ratios = self_normalised_weights(current - behaviour_log_prob, sample_dim=sample_dim, mask=mask)
+    advantage = _representable(log_weights - (current - reference_log_prob))
+    advantage = advantage - _weighted_sum(ratios, advantage, sample_dim, mask, keepdim=True)
+    return Surrogate(-_weighted_sum(ratios * advantage, log_prob, sample_dim, mask), ratios)
+
+
+def urex_surrogate(
+    log_prob: Tensor,
+    score: Tensor,
+    *,
+    tau: float | Tensor,
+    sample_dim: int = -1,
+    mask: Tensor | None = None,
+) -> Surrogate:
+    r"""UREX: policy gradient plus tau times a mean-seeking projection (Nachum et al., ICLR 2017).
+
+    .. math::
+        L(\theta) = -\frac1K \sum_k (S_k - \bar S) \log \pi_\theta(\rho_k), \quad
+        S_k = r_k + \tau K w_k, \quad
+        w = \mathrm{softmax}_k(r_k / \tau - \log \pi_\theta(\rho_k))
+
+    with S held constant and :math:`\bar S` its mean over the group. The samples are the current
+    policy's. The weights are ECPO's at tau = 0 and tau' = UREX's tau.
+
+    Args:
+        log_prob: ``[E*, K]``, log-probability of each sample under the policy being trained.
+        score: ``[E*, K]``.
+        tau: UREX's temperature; above 0.
+        sample_dim: the axis of the K samples.
+        mask: ``[E*, K]``, True where a sample is real.
+
+    Returns:
+        :class:`Surrogate`: its weights are w.
+
+    Raises:
+        ValueError: if ``tau`` is not above 0.
+
+    Examples:
+        Equal log-probabilities and tau = 1/log 3 give w = (3/4, 1/4), S = (1 + 1.5 tau, 0.5 tau):
+
+        >>> log_prob = torch.tensor([-1.0, -1.0], requires_grad=True)
+        >>> tau = 1 / math.log(3)
+        >>> loss, weights = urex_surrogate(log_prob, torch.tensor([1.0, 0.0]), tau=tau)
+        >>> loss.backward(); weights, log_prob.grad * 4 / (1 + tau)
+        (tensor([0.7500, 0.2500]), tensor([-1.,  1.]))
+    """
+    check_temperatures(tau=tau)
+    current = log_prob.detach()
+    log_weights = lifted_log_weights(score, current, tau=0.0, tau_prime=tau)
+    weights = self_normalised_weights(log_weights, sample_dim=sample_dim, mask=mask)
+    uniform = _uniform_weights(score, sample_dim, mask)
+    # A masked sample has weight 0 in both, so the quotient's denominator may be anything there.
+    signal = score + tau * weights / uniform.clamp_min(_tiny(uniform))
+    return Surrogate(_policy_gradient(log_prob, signal, uniform, sample_dim, mask), weights)
+
+
+def ment_surrogate(
+    log_prob: Tensor,
+    score: Tensor,
+    *,
+    tau: float | Tensor,
+    sample_dim: int = -1,
+    mask: Tensor | None = None,
+) -> Surrogate:
+    r"""MENT: REINFORCE with an entropy bonus (Williams 1992), baseline = the group's mean.
+
+    .. math::
+        L(\theta) = -\frac1K \sum_k (S_k - \bar S) \log \pi_\theta(\rho_k), \quad
+        S_k = r_k - \tau \log \pi_\theta(\rho_k)
+
+    with S held constant. The samples are the current policy's.
+
+    Args:
+        log_prob: ``[E*, K]``, log-probability of each sample under the policy being trained.
+        score: ``[E*, K]``.
+        tau: temperature of the entropy; 0 is plain REINFORCE.
+        sample_dim: the axis of the K samples.
+        mask: ``[E*, K]``, True where a sample is real.
+
+    Returns:
+        :class:`Surrogate`: its weights are uniform.
+
+    Examples:
+        S = (1 + 0.5 * 1, 0 + 0.5 * 1), so S - mean = +-1/2 and the gradient -+1/4:
+
+        >>> log_prob = torch.tensor([-1.0, -1.0], requires_grad=True)
+        >>> loss, weights = ment_surrogate(log_prob, torch.tensor([1.0, 0.0]), tau=0.5)
+        >>> loss.backward(); log_prob.grad
+        tensor([-0.2500,  0.2500])
+    """
+    check_temperatures(tau=tau, allow_zero=True)
+    uniform = _uniform_weights(score, sample_dim, mask)
+    signal = score - tau * log_prob.detach()
+    return Surrogate(_policy_gradient(log_prob, signal, uniform, sample_dim, mask), uniform)
+
+
+# -------------------------------------------------------------------------------- soft values
+
+
+def soft_value(
+    score: Tensor,
+    reference_log_prob: Tensor,
+    *,
+    tau: float | Tensor,
+    tau_prime: float | Tensor,
+    sample_dim: int = -1,
+    mask: Tensor | None = None,
+) -> Tensor:
+    r"""Soft value of the lifted policy by an exact sum over all actions: Eq. 8.
+
+    .. math::
+        \bar V^*(s) = (\tau + \tau') \log \sum_a
+            \exp \frac{\bar Q^*(s, a) + \tau \log \bar\pi(a|s)}{\tau + \tau'}
+
+    Args:
+        score: ``[E*, K]``, of each of the K actions there are.
+        reference_log_prob: ``[E*, K]``, under the reference policy.
+        tau: temperature of the divergence from the reference.
+        tau_prime: temperature of the entropy.
+        sample_dim: the axis of the K actions.
+        mask: ``[E*, K]``, True where an action is allowed.
+
+    Returns:
+        ``[E*]``, in the unit of the score: the maximum of
+        E score - tau KL(pi, pi_bar) + tau' H(pi) over all distributions pi.
+
+    Examples:
+        Two equal actions, log pi_bar = -log 2: 1 + tau' log 2, their score and an entropy bonus.
+
+        >>> reference = torch.tensor([0.5, 0.5]).log()
+        >>> value = soft_value(torch.ones(2), reference, tau=0.5, tau_prime=0.25)
+        >>> (value - 1) / math.log(2)
+        tensor(0.2500)
+    """
+    check_temperatures(tau=tau, tau_prime=tau_prime)
+    temperature = tau + tau_prime
+    logits = _representable((score + tau * reference_log_prob) / temperature)
+    return temperature * _masked_logsumexp(logits, sample_dim, mask)
+
+
+def soft_value_estimate(
+    score: Tensor,
+    reference_log_prob: Tensor,
+    *,
+    tau: float | Tensor,
+    tau_prime: float | Tensor,
+    sample_dim: int = -1,
+    mask: Tensor | None = None,
+) -> Tensor:
+    r"""Soft value of the lifted policy from M actions of the reference: the display above Eq. 9.
+
+    .. math::
+        \bar V^*(s) \approx (\tau + \tau') \log \frac1M \sum_{m=1}^M
+            \exp \frac{\bar Q^*(s, a_m) - \tau' \log \bar\pi(a_m|s)}{\tau + \tau'},
+        \qquad a_m \sim \bar\pi(\cdot|s)
+
+    A lower bound in expectation (Jensen), consistent as M grows; with M = 1 it is the paper's
+    one-sample estimate Q - tau' log pi_bar (Eq. 9).
+
+    Args:
+        score: ``[E*, M]``.
+        reference_log_prob: ``[E*, M]``, under the reference policy, which drew the samples.
+        tau: temperature of the divergence from the reference.
+        tau_prime: temperature of the entropy.
+        sample_dim: the axis of the M samples.
+        mask: ``[E*, M]``, True where a sample is real.
+
+    Returns:
+        ``[E*]``, in the unit of the score.
+
+    Examples:
+        One sample: 1 - 0.25 * -2 = 1.5.
+
+        >>> soft_value_estimate(torch.ones(1), torch.tensor([-2.0]), tau=0.5, tau_prime=0.25)
+        tensor(1.5000)
+    """
+    log_weights = lifted_log_weights(score, reference_log_prob, tau=tau, tau_prime=tau_prime)
+    log_uniform = _uniform_weights(score, sample_dim, mask).clamp_min(_tiny(score)).log()
+    return (tau + tau_prime) * _masked_logsumexp(log_weights + log_uniform, sample_dim, mask)
+
+
+def surrogate_reward(
+    score: Tensor,
+    log_prob: Tensor,
+    *,
+    tau: float | Tensor,
+    tau_prime: float | Tensor,
+    sample_dim: int = -1,
+    mask: Tensor | None = None,
+) -> Tensor:
+    r"""The surrogate reward SR that ECPO ascends, by an exact sum over all trajectories: Eq. 7.
+
+    .. math::
+        \mathrm{SR}(\pi) = (\tau + \tau') \log \sum_\rho
+            \exp \frac{r(\rho) + \tau \log \pi(\rho)}{\tau + \tau'}
+
+    It is the :func:`soft_value` of the problem whose actions are whole trajectories, with pi as the
+    reference.
+
+    Args:
+        score: ``[E*, K]``, return of each of the K trajectories there are.
+        log_prob: ``[E*, K]``, under pi; may carry a gradient.
+        tau: temperature of the divergence from the reference.
+        tau_prime: temperature of the entropy.
+        sample_dim: the axis of the K trajectories.
+        mask: ``[E*, K]``, True where a trajectory exists.
+
+    Returns:
+        ``[E*]``, in the unit of the return; from E r + tau' H(pi) (tau to infinity) to max r (both
+        to zero), Lemma 2.
+
+    Examples:
+        >>> log_prob = torch.tensor([0.5, 0.5]).log()
+        >>> score = torch.tensor([1.0, 0.0])
+        >>> surrogate_reward(score, log_prob, tau=1e-3, tau_prime=0.0)  # near max r
+        tensor(0.9993)
+        >>> surrogate_reward(score, log_prob, tau=1e3, tau_prime=0.0)  # near the mean
+        tensor(0.5001)
+    """
+    return soft_value(
+        score, log_prob, tau=tau, tau_prime=tau_prime, sample_dim=sample_dim, mask=mask
+    )
+
+
+def surrogate_reward_estimate(
+    score: Tensor,
+    log_prob: Tensor,
+    *,
+    tau: float | Tensor,
+    tau_prime: float | Tensor,
+    sample_dim: int = -1,
+    mask: Tensor | None = None,
+) -> Tensor:
+    r"""The surrogate reward SR (Eq. 7) from K trajectories of pi itself.
+
+    .. math::
+        \mathrm{SR}(\pi) \approx (\tau + \tau') \log \frac1K \sum_k
+            \exp \left( \frac{r(\rho_k) + \tau \log \pi(\rho_k)}{\tau + \tau'}
+            - \log \pi(\rho_k) \right), \qquad \rho_k \sim \pi
+
+    It is the :func:`soft_value_estimate` of the problem whose actions are whole trajectories.
+
+    Args:
+        score: ``[E*, K]``, return of each sampled trajectory.
+        log_prob: ``[E*, K]``, under pi, which drew them.
+        tau: temperature of the divergence from the reference.
+        tau_prime: temperature of the entropy.
+        sample_dim: the axis of the K trajectories.
+        mask: ``[E*, K]``, True where a trajectory is real.
+
+    Returns:
+        ``[E*]``, in the unit of the return.
+
+    Examples:
+        >>> log_prob = torch.tensor([0.5, 0.5]).log()
+        >>> score = torch.tensor([1.0, 1.0])
+        >>> sr = surrogate_reward_estimate(score, log_prob, tau=0.5, tau_prime=0.25)
+        >>> (sr - 1) / math.log(2)
+        tensor(0.2500)
+    """
+    return soft_value_estimate(
+        score, log_prob, tau=tau, tau_prime=tau_prime, sample_dim=sample_dim, mask=mask
+    )
+
+
+def theorem1_temperatures(horizon: float, num_trajectories: int) -> tuple[float, float]:
+    r"""The temperatures of Theorem 1, under which ECPO's regret is below 4 sqrt(T log n).
+
+    .. math::
+        \tau' = \frac{1}{\sqrt{T \log n}}, \qquad \tau + \tau' = \sqrt{\frac{T}{2 \log n}}
+
+    Args:
+        horizon: T, the number of lifts to come, for the constant choice; t, the number of the
+            lift, counted from 1, for the choice that needs no horizon.
+        num_trajectories: n, how many trajectories there are; at least 2.
+
+    Returns:
+        (tau, tau_prime), for rewards in [0, 1]. tau is not below 0, which the formula is for
+        T = 1; the reference is then the uniform start, on which the lift does not depend.
+
+    Raises:
+        ValueError: if ``horizon`` < 1 or ``num_trajectories`` < 2.
+
+    Examples:
+        >>> tau, tau_prime = theorem1_temperatures(100, 10)
+        >>> round(tau, 4), round(tau_prime, 4)
+        (4.594, 0.0659)
+    """
+    if not horizon >= 1:
+        raise ValueError(f"horizon must be at least 1, got {horizon}.")
+    if not num_trajectories >= 2:
+        raise ValueError(f"num_trajectories must be at least 2, got {num_trajectories}.")
+    log_n = math.log(num_trajectories)
+    tau_prime = 1 / math.sqrt(horizon * log_n)
+    return max(math.sqrt(horizon / (2 * log_n)) - tau_prime, 0.0), tau_prime
+
+
+# -------------------------------------------------------------------------------- masked algebra
+
+
+def _policy_gradient(
+    log_prob: Tensor, signal: Tensor, uniform: Tensor, sample_dim: int, mask: Tensor | None
+) -> Tensor:
+    """Score-function surrogate of ``signal``, centred by its mean over the group."""
+    signal = signal.detach()
+    centred = signal - _weighted_sum(uniform, signal, sample_dim, mask, keepdim=True)
+    return -_weighted_sum(uniform * centred, log_prob, sample_dim, mask)
+
+
+def _weighted_sum(
+    weights: Tensor, values: Tensor, dim: int, mask: Tensor | None, *, keepdim: bool = False
+) -> Tensor:
+    """Sum of weights times values over real samples, whatever stands in the masked ones."""
+    products = (
+        weights * values if mask is None else (weights * values.where(mask, 0.0)).where(mask, 0.0)
+    )
+    return products.sum(dim, keepdim=keepdim)
+
+
+def _uniform_weights(like: Tensor, dim: int, mask: Tensor | None) -> Tensor:
+    """1/K for each of the K real samples, 0 for the others."""
+    if mask is None:
+        return torch.full_like(like, 1 / like.shape[dim])
+    return self_normalised_weights(torch.zeros_like(like), sample_dim=dim, mask=mask)
+
+
+def _masked_logsumexp(values: Tensor, dim: int, mask: Tensor | None) -> Tensor:
+    return (values if mask is None else values.where(mask, _lowest(values))).logsumexp(dim)
+
+
+def _representable(values: Tensor) -> Tensor:
+    """Clip overflow to the largest finite numbers, so that a softmax of it is a softmax."""
+    largest = torch.finfo(values.dtype).max
+    return values.clamp(-largest, largest)
+
+
+def _lowest(like: Tensor) -> float:
+    return torch.finfo(like.dtype).min
+
+
+def _tiny(like: Tensor) -> float:
+    return torch.finfo(like.dtype).tiny
