@@ -1,0 +1,638 @@
+"""Updaters that follow named networks: PeriodicCopy, PolyakAverage, UpdaterSequence."""
+
+from __future__ import annotations
+
+import copy
+import io
+import re
+import warnings
+from collections.abc import Callable
+from typing import cast
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictParams
+from torch import nn
+from torchrl.data import Bounded
+from torchrl.modules import ProbabilisticActor, QValueActor, TanhNormal, ValueOperator
+from torchrl.objectives import (
+    DDPGLoss,
+    DQNLoss,
+    LossModule,
+    ReinforceLoss,
+    SACLoss,
+    SoftUpdate,
+    TargetNetUpdater,
+    TD3Loss,
+)
+
+from torchrl_ecpo.updaters import PeriodicCopy, PolyakAverage, UpdaterSequence
+
+NO_UPDATER = "No target network updater has been associated"
+OBSERVATIONS, ACTIONS, HIDDEN = 3, 2, 4
+
+
+class QNetwork(nn.Module):
+    """Q(s, a), with buffers: the running statistics and the batch counter of a BatchNorm layer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.inputs = nn.Linear(OBSERVATIONS + ACTIONS, HIDDEN)
+        self.norm = nn.BatchNorm1d(HIDDEN)
+        self.output = nn.Linear(HIDDEN, 1)
+
+    def forward(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        features = self.inputs(torch.cat([observation, action], -1))
+        return self.output(self.norm(features).tanh())
+
+
+class PlainQNetwork(QNetwork):
+    """The same without buffers: TorchRL's SAC and TD3 stack critics and run them in a vmap."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm = nn.Identity()
+
+
+def critic(network: type[nn.Module]) -> ValueOperator:
+    return ValueOperator(network(), in_keys=["observation", "action"])
+
+
+def deterministic_actor() -> TensorDictModule:
+    net = nn.Sequential(nn.Linear(OBSERVATIONS, HIDDEN), nn.Tanh(), nn.Linear(HIDDEN, ACTIONS))
+    return TensorDictModule(net, in_keys=["observation"], out_keys=["action"])
+
+
+def stochastic_actor() -> ProbabilisticActor:
+    net = nn.Sequential(nn.Linear(OBSERVATIONS, 2 * ACTIONS), NormalParamExtractor())
+    return ProbabilisticActor(
+        TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+        spec=Bounded(-1, 1, torch.Size([ACTIONS])),
+    )
+
+
+def sac(*, delay_actor: bool = True) -> SACLoss:
+    """SAC with two stacked critics: networks actor_network, qvalue_network."""
+    actor = stochastic_actor()
+    return SACLoss(actor, critic(PlainQNetwork), num_qvalue_nets=2, delay_actor=delay_actor)
+
+
+def sac_v1() -> SACLoss:
+    """SAC's first version: networks actor_network, value_network, qvalue_network."""
+    value = ValueOperator(nn.Linear(OBSERVATIONS, 1), in_keys=["observation"])
+    return SACLoss(stochastic_actor(), critic(PlainQNetwork), value, delay_actor=True)
+
+
+def ddpg(*, delay_actor: bool = True, delay_value: bool = True) -> DDPGLoss:
+    """DDPG, whose critic has buffers: networks actor_network, value_network."""
+    actor = deterministic_actor()
+    return DDPGLoss(actor, critic(QNetwork), delay_actor=delay_actor, delay_value=delay_value)
+
+
+def td3() -> TD3Loss:
+    """TD3, which delays all it has by default: networks actor_network, qvalue_network."""
+    spec = Bounded(-1, 1, torch.Size([ACTIONS]))
+    return TD3Loss(deterministic_actor(), critic(PlainQNetwork), action_spec=spec)
+
+
+LOSSES: dict[str, Callable[..., LossModule]] = {
+    "sac": sac,
+    "sac_v1": sac_v1,
+    "ddpg": ddpg,
+    "td3": td3,
+}
+every_loss = pytest.mark.parametrize("make_loss", LOSSES.values(), ids=LOSSES)
+every_dtype = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+
+
+@pytest.fixture(autouse=True)
+def seed() -> None:
+    torch.manual_seed(0)
+
+
+def critic_name(loss: LossModule) -> str:
+    return "value_network" if isinstance(loss, DDPGLoss) else "qvalue_network"
+
+
+def parameters(loss: LossModule, prefix: str) -> TensorDictParams:
+    """Read without TorchRL's warning about targets that have no updater."""
+    return cast(TensorDictParams, loss._modules[f"{prefix}_params"])
+
+
+def leaves(loss: LossModule, prefix: str) -> dict:
+    """The tensors themselves."""
+    return dict(parameters(loss, prefix).items(True, True))
+
+
+def snapshot(loss: LossModule, prefix: str) -> dict:
+    return {key: leaf.detach().clone() for key, leaf in leaves(loss, prefix).items()}
+
+
+def target_names(loss: LossModule) -> list[str]:
+    return [f"target_{name}" for name in loss._has_update_associated]
+
+
+def equal(left: dict, right: dict) -> bool:
+    assert left.keys() == right.keys()
+    return all(torch.equal(left[key], right[key]) for key in left)
+
+
+def train(loss: LossModule, amount: float = 1.0) -> None:
+    """Changes every parameter and buffer of every network, as some gradient steps would."""
+    for name in loss._has_update_associated:
+        for leaf in leaves(loss, name).values():
+            noise = amount * torch.rand(leaf.shape) + amount
+            leaf.data.add_(noise.to(leaf.dtype))
+
+
+def batch(dtype: torch.dtype = torch.float32, size: int = 6) -> TensorDict:
+    return TensorDict(
+        {
+            "observation": torch.randn(size, OBSERVATIONS, dtype=dtype),
+            "action": torch.rand(size, ACTIONS, dtype=dtype),
+            "next": {
+                "observation": torch.randn(size, OBSERVATIONS, dtype=dtype),
+                "reward": torch.randn(size, 1, dtype=dtype),
+                "done": torch.zeros(size, 1, dtype=torch.bool),
+                "terminated": torch.zeros(size, 1, dtype=torch.bool),
+            },
+        },
+        batch_size=[size],
+    )
+
+
+def both(loss: LossModule, interval: int = 3, tau: float = 0.25) -> UpdaterSequence:
+    others = [name for name in loss._has_update_associated if name != "actor_network"]
+    return UpdaterSequence(
+        PeriodicCopy(loss, "actor_network", interval=interval),
+        PolyakAverage(loss, *others, tau=tau),
+    )
+
+
+class TestPeriodicCopy:
+    @pytest.mark.parametrize("interval", [1, 2, 3, 5])
+    @every_loss
+    def test_copies_on_exactly_every_nth_call(self, make_loss, interval):
+        loss = make_loss()
+        updater = PeriodicCopy(loss, "actor_network", interval=interval)
+        before = snapshot(loss, "target_actor_network")
+        copies = []
+        for call in range(1, 13):
+            train(loss)
+            updater.step()
+            after = snapshot(loss, "target_actor_network")
+            if equal(after, snapshot(loss, "actor_network")):
+                copies.append(call)
+            else:
+                assert equal(after, before)
+            before = after
+        assert copies == list(range(interval, 13, interval))
+
+    def test_copies_buffers_frozen_layers_and_integers(self):
+        loss = ddpg()
+        loss.value_network_params["module", "output", "weight"].requires_grad_(False)
+        updater = PeriodicCopy(loss, "value_network", interval=1)
+        before = snapshot(loss, "target_value_network")
+        train(loss)
+        updater.step()
+        after = snapshot(loss, "target_value_network")
+        assert equal(after, snapshot(loss, "value_network"))
+        changed = {key for key in after if not torch.equal(before[key], after[key])}
+        assert {
+            ("module", "norm", "running_var"),
+            ("module", "norm", "num_batches_tracked"),
+            ("module", "output", "weight"),
+        } <= changed
+
+    def test_a_shorter_interval_after_loading_copies_at_the_next_call(self):
+        loss = ddpg()
+        updater = PeriodicCopy(loss, "actor_network", interval=2)
+        updater.load_state_dict({"initialized": True, "counter": 7})
+        train(loss)
+        updater.step()
+        assert equal(snapshot(loss, "target_actor_network"), snapshot(loss, "actor_network"))
+        assert updater.counter == 0
+
+    def test_init_counts_anew(self):
+        loss = ddpg()
+        updater = PeriodicCopy(loss, "actor_network", interval=2)
+        updater.step()
+        updater.init_()
+        train(loss)
+        updater.step()
+        assert not equal(snapshot(loss, "target_actor_network"), snapshot(loss, "actor_network"))
+        updater.step()
+        assert equal(snapshot(loss, "target_actor_network"), snapshot(loss, "actor_network"))
+
+    def test_counts_when_compiled(self):
+        loss = ddpg()
+        updater = PeriodicCopy(loss, "actor_network", interval=3)
+        step = torch.compile(updater.step, backend="eager", fullgraph=True)
+        copies = []
+        for call in range(1, 14):
+            train(loss)
+            step()
+            if equal(snapshot(loss, "target_actor_network"), snapshot(loss, "actor_network")):
+                copies.append(call)
+        assert copies == [3, 6, 9, 12]
+
+    @pytest.mark.parametrize("interval", [0, -1, 2.0, 2.5, True, "3", None])
+    def test_interval_must_be_a_positive_int(self, interval):
+        with pytest.raises(ValueError, match=f"interval must be a positive int.*got {interval!r}"):
+            PeriodicCopy(ddpg(), "actor_network", interval=interval)
+
+
+class TestPolyakAverage:
+    @pytest.mark.parametrize("tau", [0.005, 0.25, 1.0])
+    @every_dtype
+    @every_loss
+    def test_is_the_exponential_average(self, make_loss, dtype, tau):
+        loss = make_loss().to(dtype)
+        name = critic_name(loss)
+        updater = PolyakAverage(loss, name, tau=tau)
+        expected = snapshot(loss, f"target_{name}")
+        for _ in range(4):
+            train(loss)
+            updater.step()
+            for key, source in snapshot(loss, name).items():
+                if source.is_floating_point():
+                    expected[key] = (1 - tau) * expected[key] + tau * source
+                else:
+                    expected[key] = source
+        torch.testing.assert_close(snapshot(loss, f"target_{name}"), expected)
+
+    def test_agrees_with_torchrl(self):
+        ours, theirs = sac(), sac()
+        theirs.load_state_dict(ours.state_dict())
+        updaters = PolyakAverage(ours, tau=0.1), SoftUpdate(theirs, tau=0.1)
+        for _ in range(3):
+            train(ours)
+            theirs.actor_network_params.data.copy_(ours.actor_network_params.data)
+            theirs.qvalue_network_params.data.copy_(ours.qvalue_network_params.data)
+            for updater in updaters:
+                updater.step()
+        for name in ("target_actor_network", "target_qvalue_network"):
+            torch.testing.assert_close(snapshot(ours, name), snapshot(theirs, name))
+
+    @pytest.mark.parametrize("tau", [0, -0.1, 1.1, float("nan"), float("inf")])
+    def test_tau_must_be_in_the_unit_interval(self, tau):
+        with pytest.raises(ValueError, match=re.escape("tau must be in (0, 1]")):
+            PolyakAverage(ddpg(), "value_network", tau=tau)
+
+
+UPDATERS = {
+    "periodic": lambda loss, *networks: PeriodicCopy(loss, *networks, interval=1),
+    "polyak": lambda loss, *networks: PolyakAverage(loss, *networks, tau=0.5),
+}
+
+
+def expected_after_one_step(updater: TargetNetUpdater, loss: LossModule, name: str) -> dict:
+    """What UPDATERS do: copy, or go half of the way."""
+    target, source = snapshot(loss, f"target_{name}"), snapshot(loss, name)
+    if isinstance(updater, PeriodicCopy):
+        return source
+    return {key: (target[key] + source[key]) / 2 for key in target}
+
+
+every_updater = pytest.mark.parametrize("make_updater", UPDATERS.values(), ids=UPDATERS)
+
+
+@every_updater
+class TestNamedNetworks:
+    @every_loss
+    def test_touches_its_own_network_only(self, make_updater, make_loss):
+        loss = make_loss()
+        train(loss)  # every target is now away from its source, so that a stray copy would show
+        others = [name for name in loss._has_update_associated if name != "actor_network"]
+        before = {name: snapshot(loss, f"target_{name}") for name in others}
+        own = snapshot(loss, "target_actor_network")
+        updater = make_updater(loss, "actor_network")
+        train(loss)
+        updater.step()
+        updater.init_()
+        assert not equal(snapshot(loss, "target_actor_network"), own)
+        assert others
+        for name in others:
+            assert equal(snapshot(loss, f"target_{name}"), before[name])
+
+    def test_without_names_follows_all(self, make_updater):
+        loss = td3()
+        updater = make_updater(loss)
+        assert updater.networks == ("actor_network", "qvalue_network")
+        assert all(loss._has_update_associated.values())
+
+    def test_construction_copies(self, make_updater):
+        loss = sac()
+        train(loss)
+        make_updater(loss, "qvalue_network")
+        assert equal(snapshot(loss, "target_qvalue_network"), snapshot(loss, "qvalue_network"))
+
+    def test_torchrl_still_warns_about_a_forgotten_network(self, make_updater):
+        loss = sac()
+        make_updater(loss, "actor_network")
+        with pytest.warns(UserWarning, match=NO_UPDATER):
+            loss(batch())
+        make_updater(loss, "qvalue_network")
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            loss(batch())
+
+    def test_reset_then_init_starts_level_again(self, make_updater):
+        loss = ddpg()
+        updater = make_updater(loss)
+        loss.reset_parameters_recursive()
+        target, source = snapshot(loss, "target_actor_network"), snapshot(loss, "actor_network")
+        assert not equal(target, source)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            updater.init_()
+        assert equal(snapshot(loss, "target_actor_network"), source)
+
+    def test_targets_remain_the_same_buffers(self, make_updater):
+        loss = sac()
+        buffers = {id(buffer) for buffer in loss.buffers()}
+        trained = {name for name, _ in loss.named_parameters()}
+        before = leaves(loss, "target_qvalue_network")
+        updater = make_updater(loss, "qvalue_network")
+        train(loss)
+        updater.step()
+        after = leaves(loss, "target_qvalue_network")
+        assert trained == {name for name, _ in loss.named_parameters()}
+        for key, target in after.items():
+            assert target is before[key]
+            assert id(target) in buffers
+            assert not target.requires_grad
+            assert target.grad_fn is None
+            assert target.grad is None
+
+    @every_loss
+    def test_follows_a_loss_that_was_cast(self, make_updater, make_loss):
+        loss = make_loss()
+        updater = make_updater(loss, "actor_network")
+        for dtype in (torch.float64, torch.float32):
+            loss.to(dtype)
+            train(loss)
+            expected = expected_after_one_step(updater, loss, "actor_network")
+            updater.step()
+            after = snapshot(loss, "target_actor_network")
+            assert all(leaf.dtype == dtype for leaf in after.values())
+            torch.testing.assert_close(after, expected)
+
+    def test_a_copied_updater_follows_the_copied_loss(self, make_updater):
+        loss = ddpg()
+        updater = make_updater(loss, "actor_network")
+        copied_loss, copied = copy.deepcopy((loss, updater))
+        assert copied.loss_module is copied_loss
+        before = snapshot(loss, "target_actor_network")
+        first = snapshot(copied_loss, "target_actor_network")
+        train(copied_loss)
+        copied.step()
+        assert equal(snapshot(loss, "target_actor_network"), before)
+        assert not equal(snapshot(copied_loss, "target_actor_network"), first)
+
+    def test_compiles(self, make_updater):
+        loss = sac()
+        updater = make_updater(loss, "qvalue_network")
+        step = torch.compile(updater.step, backend="eager", fullgraph=True)
+        for _ in range(3):
+            train(loss)
+            expected = expected_after_one_step(updater, loss, "qvalue_network")
+            step()
+            torch.testing.assert_close(snapshot(loss, "target_qvalue_network"), expected)
+
+
+class TestErrorsAtTheDoor:
+    @every_updater
+    @pytest.mark.parametrize(
+        ("make_loss", "networks", "message"),
+        [
+            (lambda: nn.Linear(1, 1), (), "must be a torchrl LossModule, got Linear"),
+            (
+                sac,
+                ("actor",),
+                "SACLoss has no network 'actor'; its delayed networks: "
+                "['actor_network', 'qvalue_network']",
+            ),
+            (td3, ("target_actor_network_params",), "TD3Loss has no network 'target_actor"),
+            (
+                lambda: sac(delay_actor=False),
+                ("actor_network",),
+                "'actor_network' of SACLoss has no delayed parameters. Build the loss with "
+                "delay_actor=True.",
+            ),
+            (
+                lambda: ddpg(delay_value=False),
+                ("actor_network", "value_network"),
+                "Build the loss with delay_value=True.",
+            ),
+            (
+                lambda: ddpg(delay_actor=False, delay_value=False),
+                (),
+                "DDPGLoss has no delayed networks. Build the loss with delay_actor=True or "
+                "delay_value=True.",
+            ),
+            (
+                lambda: ReinforceLoss(
+                    stochastic_actor(), ValueOperator(nn.Linear(3, 1), in_keys=["observation"])
+                ),
+                ("critic_network",),
+                "'critic_network' of ReinforceLoss has no delayed parameters. Build the loss with "
+                "delay_value=True.",
+            ),
+            (sac, ("actor_network", "actor_network"), "'actor_network' is named twice"),
+        ],
+    )
+    def test_networks(self, make_updater, make_loss, networks, message):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            make_updater(make_loss(), *networks)
+
+    @every_updater
+    def test_a_refused_updater_leaves_no_mark(self, make_updater):
+        loss = sac()
+        with pytest.raises(ValueError, match="no network"):
+            make_updater(loss, "actor_network", "critic")
+        assert not any(loss._has_update_associated.values())
+
+    @every_updater
+    def test_targets_that_require_a_gradient(self, make_updater):
+        loss = sac()
+        target = parameters(loss, "target_actor_network")
+        # The mistake: without preserve_module_state=False the targets become Parameters.
+        with target.to_module(loss.actor_network):
+            pass
+        message = "target_actor_network_params requires a gradient.*preserve_module_state=False"
+        with pytest.raises(RuntimeError, match=message):
+            make_updater(loss)
+        assert not any(loss._has_update_associated.values())
+
+    @every_updater
+    def test_step_before_init(self, make_updater):
+        updater = make_updater(sac())
+        updater.load_state_dict(updater.state_dict() | {"initialized": False})
+        with pytest.raises(RuntimeError, match=r"Call \w+\.init_\(\) before step\(\)"):
+            updater.step()
+
+
+class TestUpdaterSequence:
+    @every_loss
+    def test_steps_each(self, make_loss):
+        loss, alone = make_loss(), make_loss()
+        alone.load_state_dict(loss.state_dict())
+        sequence = both(loss)
+        separate = both(alone).updaters
+        for _ in range(7):
+            train(loss)
+            for name in loss._has_update_associated:
+                for key, leaf in leaves(alone, name).items():
+                    leaf.data.copy_(leaves(loss, name)[key])
+            sequence.step()
+            for updater in separate:
+                updater.step()
+        for name in loss._has_update_associated:
+            assert equal(snapshot(loss, f"target_{name}"), snapshot(alone, f"target_{name}"))
+        sequence.init_()
+        for name in loss._has_update_associated:
+            assert equal(snapshot(loss, f"target_{name}"), snapshot(loss, name))
+
+    def test_is_an_updater_of_the_loss(self):
+        loss = sac_v1()
+        copies = PeriodicCopy(loss, "actor_network", interval=2)
+        averages = [PolyakAverage(loss, name) for name in ("qvalue_network", "value_network")]
+        sequence = UpdaterSequence(copies, UpdaterSequence(*averages))
+        assert isinstance(sequence, TargetNetUpdater)
+        assert sequence.loss_module is loss
+        assert sequence.initialized
+        with pytest.raises(ValueError, match="target_qvalue_network_params has two updaters"):
+            UpdaterSequence(sequence, PolyakAverage(loss, "qvalue_network"))
+
+    def test_warns_about_a_forgotten_network(self):
+        loss = sac_v1()
+        copies = PeriodicCopy(loss, "actor_network", interval=2)
+        message = (
+            r"No updater follows the delayed network\(s\) \['value_network', 'qvalue_network'\]"
+        )
+        with pytest.warns(UserWarning, match=message):
+            UpdaterSequence(copies)
+        with pytest.warns(UserWarning, match=NO_UPDATER):
+            loss(batch())
+
+    @pytest.mark.parametrize(
+        ("make_updaters", "message"),
+        [
+            (lambda a, b: [], "at least one updater"),
+            (lambda a, b: [PolyakAverage(a), a], "takes TargetNetUpdaters, got SACLoss"),
+            (lambda a, b: [PolyakAverage(a), PolyakAverage(b)], "must belong to one loss"),
+            (
+                lambda a, b: [PolyakAverage(a), PeriodicCopy(a, "actor_network", interval=2)],
+                "target_actor_network_params has two updaters, PolyakAverage and PeriodicCopy",
+            ),
+            (
+                lambda a, b: [SoftUpdate(a, tau=0.1), PolyakAverage(a, "qvalue_network")],
+                "target_qvalue_network_params has two updaters, SoftUpdate and PolyakAverage",
+            ),
+        ],
+    )
+    def test_refuses(self, make_updaters, message):
+        with pytest.raises(ValueError, match=message):
+            UpdaterSequence(*make_updaters(sac(), sac()))
+
+    @every_dtype
+    @every_loss
+    def test_a_training_loop(self, make_loss, dtype):
+        loss = make_loss().to(dtype)
+        optimizer = torch.optim.SGD(loss.parameters(), lr=0.1)
+        updater = both(loss, interval=2)
+        before = {name: snapshot(loss, name) for name in target_names(loss)}
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            for _ in range(2):
+                out = loss(batch(dtype))
+                losses = [value for key, value in out.items() if key.startswith("loss_")]
+                torch.stack(losses).sum().backward()
+                optimizer.step()
+                optimizer.zero_grad()
+                updater.step()
+        assert equal(snapshot(loss, "target_actor_network"), snapshot(loss, "actor_network"))
+        for name in target_names(loss):
+            assert not equal(snapshot(loss, name), before[name])
+            assert not any(leaf.requires_grad for leaf in leaves(loss, name).values())
+
+
+class TestCheckpoints:
+    @every_loss
+    def test_a_resumed_run_is_the_uninterrupted_run(self, make_loss):
+        def run(loss, updater, calls):
+            for call in calls:
+                torch.manual_seed(call)
+                train(loss)
+                updater.step()
+
+        straight = make_loss()
+        first, resumed = make_loss(), make_loss()
+        first.load_state_dict(straight.state_dict())
+        updater = both(straight)
+        run(straight, updater, range(11))
+
+        interrupted = both(first)
+        run(first, interrupted, range(4))
+        file = io.BytesIO()
+        torch.save({"loss": first.state_dict(), "updater": interrupted.state_dict()}, file)
+        file.seek(0)
+        saved = torch.load(file, weights_only=True)
+        continued = both(resumed)
+        resumed.load_state_dict(saved["loss"])
+        continued.load_state_dict(saved["updater"])
+        assert continued.state_dict() == interrupted.state_dict()
+        run(resumed, continued, range(4, 11))
+
+        assert continued.state_dict() == updater.state_dict()
+        assert continued.state_dict()["updaters"][0] == {"initialized": True, "counter": 11 % 3}
+        for name in target_names(straight):
+            assert equal(snapshot(resumed, name), snapshot(straight, name))
+
+    def test_a_state_of_another_kind_is_refused(self):
+        loss = sac()
+        copies = PeriodicCopy(loss, "actor_network", interval=2)
+        averages = PolyakAverage(loss, "qvalue_network")
+        sequence = UpdaterSequence(copies, averages)
+        refused = [
+            (copies, averages.state_dict(), r"PeriodicCopy has the entries \['counter', 'init"),
+            (averages, copies.state_dict(), r"PolyakAverage has the entries \['initialized'\]"),
+            (copies, {}, r"got \[\]"),
+            (sequence, copies.state_dict(), "one entry, 'updaters', with 2 states"),
+            (sequence, {"updaters": [copies.state_dict()]}, "one entry, 'updaters', with 2"),
+        ]
+        for updater, state, message in refused:
+            with pytest.raises(ValueError, match=message):
+                updater.load_state_dict(state)
+
+
+@pytest.mark.parametrize(
+    ("updater", "expected"),
+    [
+        (
+            lambda: PeriodicCopy(td3(), interval=7),
+            "(TD3Loss, 'actor_network', 'qvalue_network', int",
+        ),
+        (lambda: both(ddpg()), "PolyakAverage(DDPGLoss, 'value_network', tau=0.25),\n)"),
+    ],
+)
+def test_repr(updater, expected):
+    assert expected in repr(updater())
+
+
+def test_a_lazy_network_initialised_after_the_loss():
+    net = nn.LazyLinear(ACTIONS)
+    actor = QValueActor(net, in_keys=["observation"], action_space="one-hot")
+    loss = DQNLoss(actor, action_space="one-hot", delay_value=True)
+    actor(batch())
+    updater = PeriodicCopy(loss, "value_network", interval=2)
+    train(loss)
+    updater.step()
+    assert not equal(snapshot(loss, "target_value_network"), snapshot(loss, "value_network"))
+    updater.step()
+    assert equal(snapshot(loss, "target_value_network"), snapshot(loss, "value_network"))
