@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torchrl.objectives import LossModule
+
+from torchrl_ecpo.functional import theorem1_temperatures
+from torchrl_ecpo.schedules import (
+    TemperatureScheduler,
+    constant,
+    exponential,
+    linear,
+    make_schedule,
+    theorem1_schedules,
+)
+
+
+class Loss(LossModule):
+    _schedulable_buffers = frozenset({"tau", "tau_prime"})
+
+    def __init__(self):
+        super().__init__()
+        self.register_coeff_buffer("tau", 0.5)
+        self.register_coeff_buffer("tau_prime", 0.1)
+
+
+@pytest.mark.parametrize(
+    ("schedule", "expected"),
+    [
+        (constant(0.3), [0.3, 0.3, 0.3, 0.3]),
+        (linear(0.4, 0.2, 10), [0.4, 0.3, 0.2, 0.2]),
+        (linear(0.0, 1.0, 10), [0.0, 0.5, 1.0, 1.0]),
+        (exponential(1.0, 0.01, 10), [1.0, 0.1, 0.01, 0.01]),
+    ],
+)
+def test_values_at_start_half_end_and_after(schedule, expected):
+    assert [schedule(count) for count in (0, 5, 10, 1_000)] == pytest.approx(expected, rel=1e-12)
+
+
+def test_linear_ends_at_exactly_its_end():
+    assert linear(0.05, 0.0, 3)(3) == 0.0
+
+
+@pytest.mark.parametrize("lift", [1, 2, 50])
+def test_theorem1_counts_lifts_from_one(lift):
+    schedules = theorem1_schedules(7)
+    expected = theorem1_temperatures(lift, 7)
+    assert (schedules["tau"](lift - 1), schedules["tau_prime"](lift - 1)) == expected
+    constant_choice = theorem1_schedules(7, horizon=50)
+    assert constant_choice["tau"](lift - 1) == theorem1_temperatures(50, 7)[0]
+
+
+def test_scheduler_writes_the_loss_and_counts_what_it_is_told():
+    loss = Loss()
+    temperatures = TemperatureScheduler(loss, tau_prime=linear(0.2, 0.0, 100))
+    assert loss.tau_prime.item() == pytest.approx(0.2)
+    temperatures.step(25)
+    temperatures.step(25)
+    assert loss.tau_prime.item() == pytest.approx(0.1)
+    assert loss.tau.item() == 0.5
+    assert temperatures.values() == {"tau_prime": pytest.approx(0.1)}
+
+
+def test_scheduler_continues_from_its_state():
+    schedules = {"tau": exponential(1.0, 0.1, 40), "tau_prime": linear(0.2, 0.0, 100)}
+    uninterrupted = TemperatureScheduler(Loss(), **schedules)
+    uninterrupted.step(30)
+    resumed = TemperatureScheduler(Loss(), **schedules)
+    resumed.load_state_dict(uninterrupted.state_dict())
+    for scheduler in (uninterrupted, resumed):
+        scheduler.step(3)
+    for name in schedules:
+        assert torch.equal(
+            getattr(uninterrupted.loss_module, name), getattr(resumed.loss_module, name)
+        )
+
+
+@pytest.mark.parametrize(
+    ("setting", "at_five"),
+    [
+        (0.3, 0.3),
+        (1, 1.0),
+        ({"schedule": "constant", "value": 0.3}, 0.3),
+        ({"schedule": "linear", "start": 1.0, "end": 0.0, "duration": 10}, 0.5),
+        ({"schedule": "exponential", "start": 1.0, "end": 0.01, "duration": 10}, 0.1),
+    ],
+)
+def test_schedule_from_a_configuration(setting, at_five):
+    assert make_schedule(setting)(5) == pytest.approx(at_five)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: linear(1.0, 0.0, 0), "duration must be positive, got 0"),
+        (lambda: exponential(1.0, 0.1, -1), "duration must be positive, got -1"),
+        (lambda: exponential(1.0, 0.0, 10), "Use a linear one to reach 0"),
+        (lambda: make_schedule({"schedule": "cosine"}), "one of .*linear.*, got 'cosine'"),
+        (lambda: make_schedule({"start": 1.0}), "got None"),
+        (lambda: make_schedule({"schedule": "linear", "start": 1.0}), "Wrong arguments.*'end'"),
+        (lambda: TemperatureScheduler(Loss(), tua=constant(1.0)), r"no temperature 'tua'.*'tau'"),
+        (lambda: linear(1.0, 0.0, math.nan), "duration must be positive, got nan"),
+    ],
+)
+def test_bad_input_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -1,0 +1,6 @@
+"""The paper's problems as batched TorchRL environments, and groups over any environment."""
+
+from torchrl_ecpo.envs.algorithmic import TASKS, AlgorithmicEnv, AlgorithmicTask
+from torchrl_ecpo.envs.bandit import BanditEnv
+
+__all__ = ["TASKS", "AlgorithmicEnv", "AlgorithmicTask", "BanditEnv"]

@@ -1,0 +1,200 @@
+"""Temperatures over time.
+
+A schedule is a function from a count to a temperature. What is counted is the caller's choice:
+project steps, lifts or trajectories; :class:`TemperatureScheduler` counts what ``step`` is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from torchrl.objectives import LossModule
+
+from torchrl_ecpo.functional import theorem1_temperatures
+
+__all__ = [
+    "Schedule",
+    "TemperatureScheduler",
+    "constant",
+    "exponential",
+    "linear",
+    "make_schedule",
+    "theorem1_schedules",
+]
+
+Schedule = Callable[[float], float]
+
+
+def constant(value: float) -> Schedule:
+    """Always ``value``.
+
+    Examples:
+        >>> constant(0.5)(1_000)
+        0.5
+    """
+    return lambda count: value
+
+
+def linear(start: float, end: float, duration: float) -> Schedule:
+    """From ``start`` to ``end`` in a straight line over ``duration`` counts, then ``end``.
+
+    Raises:
+        ValueError: if ``duration`` is not positive.
+
+    Examples:
+        >>> tau_prime = linear(0.02, 0.0, 100)
+        >>> [tau_prime(count) for count in (0, 50, 100, 200)]
+        [0.02, 0.01, 0.0, 0.0]
+    """
+    _check_duration(duration)
+
+    def schedule(count: float) -> float:
+        progress = min(count / duration, 1.0)
+        return (1 - progress) * start + progress * end
+
+    return schedule
+
+
+def exponential(start: float, end: float, duration: float) -> Schedule:
+    """From ``start`` to ``end`` by a constant factor over ``duration`` counts, then ``end``.
+
+    Raises:
+        ValueError: if ``duration``, ``start`` or ``end`` is not positive.
+
+    Examples:
+        >>> tau_prime = exponential(0.02, 0.0002, 100)
+        >>> [round(tau_prime(count), 6) for count in (0, 50, 100, 200)]
+        [0.02, 0.002, 0.0002, 0.0002]
+    """
+    _check_duration(duration)
+    if not (start > 0 and end > 0):
+        raise ValueError(
+            f"An exponential schedule needs start > 0 and end > 0, got {start} and {end}. "
+            "Use a linear one to reach 0."
+        )
+    return lambda count: start * (end / start) ** min(count / duration, 1.0)
+
+
+def theorem1_schedules(num_trajectories: int, *, horizon: int | None = None) -> dict[str, Schedule]:
+    """Theorem 1's temperatures for ``tau`` and ``tau_prime``; counts are lifts.
+
+    Args:
+        num_trajectories: how many trajectories (actions of a bandit) there are.
+        horizon: total number of lifts for the constant choice; None (default) for the one that
+            changes with the number of the lift.
+
+    Examples:
+        >>> schedules = theorem1_schedules(10)
+        >>> [round(schedules["tau_prime"](count), 3) for count in (0, 99)]
+        [0.659, 0.066]
+    """
+
+    def temperature(index: int) -> Schedule:
+        return lambda count: theorem1_temperatures(
+            count + 1 if horizon is None else horizon, num_trajectories
+        )[index]
+
+    return {"tau": temperature(0), "tau_prime": temperature(1)}
+
+
+def make_schedule(setting: float | Mapping[str, Any]) -> Schedule:
+    """The schedule that a configuration describes.
+
+    Args:
+        setting: a number, which is held, or a mapping with ``schedule`` (``"constant"``,
+            ``"linear"`` or ``"exponential"``) and that function's arguments.
+
+    Raises:
+        ValueError: for an unknown schedule or wrong arguments.
+
+    Examples:
+        >>> make_schedule(0.5)(10)
+        0.5
+        >>> make_schedule({"schedule": "linear", "start": 1.0, "end": 0.0, "duration": 20})(10)
+        0.5
+    """
+    if not isinstance(setting, Mapping):
+        return constant(float(setting))
+    arguments = dict(setting)
+    kind = arguments.pop("schedule", None)
+    if kind not in _SCHEDULES:
+        raise ValueError(f"schedule must be one of {sorted(_SCHEDULES)}, got {kind!r}.")
+    try:
+        return _SCHEDULES[kind](**arguments)
+    except TypeError as error:
+        raise ValueError(f"Wrong arguments for the schedule {kind!r}: {error}.") from error
+
+
+_SCHEDULES: dict[str, Callable[..., Schedule]] = {
+    "constant": constant,
+    "exponential": exponential,
+    "linear": linear,
+}
+
+
+class TemperatureScheduler:
+    """Writes scheduled temperatures into a loss.
+
+    Args:
+        loss_module: a loss whose temperatures are schedulable buffers, as all of this package are.
+        schedules: by temperature, for example ``tau_prime=linear(0.02, 0.0, 800)``. Their values
+            at 0 are written at once.
+
+    Raises:
+        ValueError: if the loss has no schedulable temperature of that name.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.objectives import LossModule
+        >>> class Loss(LossModule):
+        ...     _schedulable_buffers = frozenset({"tau_prime"})
+        ...     def __init__(self):
+        ...         super().__init__()
+        ...         self.register_coeff_buffer("tau_prime", 1.0)
+        >>> loss_module = Loss()
+        >>> temperatures = TemperatureScheduler(loss_module, tau_prime=linear(0.02, 0.0, 100))
+        >>> temperatures.step(50)
+        >>> loss_module.tau_prime
+        tensor(0.0100)
+    """
+
+    def __init__(self, loss_module: LossModule, **schedules: Schedule) -> None:
+        known = sorted(type(loss_module)._all_schedulable_buffers)
+        for name in schedules:
+            if name not in known:
+                raise ValueError(
+                    f"{type(loss_module).__name__} has no temperature {name!r} to schedule; "
+                    f"it has {known}."
+                )
+        self.loss_module = loss_module
+        self.schedules = schedules
+        self.count = 0.0
+        self._write()
+
+    def step(self, count: float = 1) -> None:
+        """Advance by ``count`` and write the temperatures."""
+        self.count += count
+        self._write()
+
+    def values(self) -> dict[str, float]:
+        """The temperatures as they stand, by name."""
+        return {name: float(schedule(self.count)) for name, schedule in self.schedules.items()}
+
+    def _write(self) -> None:
+        for name, value in self.values().items():
+            setattr(self.loss_module, name, value)
+
+    def state_dict(self) -> dict[str, float]:
+        """The count; the schedules are configuration."""
+        return {"count": self.count}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        """Continue at a saved count, and write its temperatures."""
+        self.count = state_dict["count"]
+        self._write()
+
+
+def _check_duration(duration: float) -> None:
+    if not duration > 0:
+        raise ValueError(f"duration must be positive, got {duration}.")
