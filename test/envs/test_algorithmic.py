@@ -1,0 +1,815 @@
+"""The algorithmic tasks against recordings of the original implementation, and as a TorchRL env."""
+
+from __future__ import annotations
+
+import copy
+import io
+import json
+import lzma
+from collections import defaultdict
+from collections.abc import Callable, Generator
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.checkpoint import StateDictCheckpointAdapter
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, ParallelEnv, RewardSum, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_ecpo.envs._groups import GroupIdAllocator
+from torchrl_ecpo.envs.algorithmic import TASKS, AlgorithmicEnv
+
+DATA = Path(__file__).parents[1] / "data"
+GYM_NAMES = {
+    "copy": "Copy",
+    "duplicated_input": "DuplicatedInput",
+    "repeat_copy": "RepeatCopy",
+    "reverse": "Reverse",
+    "reversed_addition": "ReversedAddition",
+    "reversed_addition3": "ReversedAddition3",
+}
+TASK_NAMES = list(GYM_NAMES)
+
+
+@cache
+def recordings(name: str) -> dict[str, list[dict[str, Any]]]:
+    """What was recorded, by gym's name of the task."""
+    result = defaultdict(list)
+    with lzma.open(DATA / f"{name}.jsonl.xz", "rt") as lines:
+        for line in lines:
+            recording = json.loads(line)
+            result[recording["task"]].append(recording)
+    return result
+
+
+def pad(rows: list[list], width: int, value: Any = -1) -> Tensor:
+    """Stack lists of unequal length; an entry may be a list itself."""
+    filler = [value] * len(rows[0][0]) if isinstance(rows[0][0], list) else value
+    return torch.tensor([row + [filler] * (width - len(row)) for row in rows])
+
+
+def as_instance(inputs: list[list], batch: tuple[int, int]) -> TensorDict:
+    """A tensordict that resets to the given inputs."""
+    padded = pad(inputs, max(map(len, inputs)))
+    return TensorDict({"instance": padded.reshape(*batch, *padded.shape[1:])}, batch)
+
+
+def act(td: TensorDictBase, action: Tensor, active: Tensor | None = None) -> TensorDictBase:
+    """Set the action, and which episodes are to take it."""
+    td["action"] = action.reshape(*td.batch_size, 3)
+    if active is None:
+        return td.exclude("_step")
+    return td.set("_step", active.reshape(td.batch_size))
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_recorded_episodes_are_reproduced(task):
+    episodes = recordings("algorithmic")[GYM_NAMES[task]]
+    assert len(episodes) == 200
+    batch = (50, 4)
+    env = AlgorithmicEnv(task, num_groups=batch[0], group_size=batch[1])
+    td = env.reset(as_instance([e["input"] for e in episodes], batch)).exclude("instance")
+    steps = torch.tensor([len(e["actions"]) for e in episodes])
+    longest = int(steps.max())
+    actions = pad([e["actions"] for e in episodes], longest, 0)
+    observations = pad([e["observations"] for e in episodes], longest + 1)
+    rewards = pad([e["rewards"] for e in episodes], longest, 0.0)
+    dones = pad([e["dones"] for e in episodes], longest, True)
+    heads = pad([e["read_head_after"] for e in episodes], longest, 0)
+    largest = torch.tensor([e["max_reward"] for e in episodes])
+
+    assert td["attainable"].flatten().equal(largest.float())
+    assert td["observation"].flatten().equal(observations[:, 0])
+    total = torch.zeros(len(episodes))
+    for t in range(longest):
+        active = t < steps
+        before, head_before = td["observation"].flatten(), env.read_head
+        following = env.step(act(td, actions[:, t], active))["next"]
+        head = torch.where(
+            active.reshape(batch + (1,) * (heads.ndim - 2)),
+            heads[:, t].reshape(head_before.shape),
+            head_before,
+        )
+        assert (
+            following["observation"]
+            .flatten()
+            .equal(torch.where(active, observations[:, t + 1], before))
+        )
+        assert following["reward"].flatten().equal(rewards[:, t])
+        assert following["done"].flatten().equal(dones[:, t])
+        assert following["terminated"].equal(following["done"])
+        assert not following["truncated"].any()
+        assert following["previous_action"].reshape(-1, 3)[active].equal(actions[active, t])
+        assert env.read_head.equal(head)
+        total += following["reward"].flatten()
+        td = env.step_mdp(td)
+    assert td["done"].all()
+    assert total.equal(torch.tensor([e["total_reward"] for e in episodes]))
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_recorded_targets_and_time_limits(task):
+    episodes = recordings("algorithmic")[GYM_NAMES[task]]
+    batch = (200, 1)
+    instance = as_instance([e["input"] for e in episodes], batch)
+    env = AlgorithmicEnv(task, num_groups=200)
+
+    targets = pad([e["target"] for e in episodes], 100, 0)
+    td, total = env.reset(instance.clone()), torch.zeros(200)
+    for t in range(96):
+        character = targets[:, t]
+        blind = torch.stack([character * 0, character * 0 + 1, character], -1)
+        td = env.step(act(td, blind, ~td["done"].flatten()))
+        total += td["next", "reward"].flatten()
+        td = env.step_mdp(td)
+    assert total.equal(torch.tensor([float(len(e["target"])) for e in episodes]))
+
+    td, clock = env.reset(instance.clone()), torch.zeros(200, dtype=torch.int64)
+    while not td["done"].all():
+        clock += ~td["done"].flatten()
+        idle = torch.zeros(200, 3, dtype=torch.int64)
+        td = env.step(act(td, idle, ~td["done"].flatten()))
+        assert td["next", "reward"].equal(-1.0 * (td["next", "done"] & ~td["done"]))
+        td = env.step_mdp(td)
+    assert clock.equal(torch.tensor([e["time_limit"] + 1 for e in episodes]))
+
+
+def input_of(task: str, length: int, target_length: int) -> list:
+    """Some input of so many columns, with such a target."""
+    rows = TASKS[task].rows
+    if rows == 1:
+        return [1] * length
+    return [[2 if target_length > length else 0] * rows] * length
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_recorded_curricula_are_reproduced(task):
+    runs = recordings("algorithmic_curriculum")[GYM_NAMES[task]]
+    batch = (len(runs), 1)
+    first = torch.tensor([run["init_reset_target_len"] for run in runs])
+
+    def make(seed: int) -> AlgorithmicEnv:
+        return AlgorithmicEnv(task, num_groups=len(runs), curriculum="gym", seed=seed)
+
+    # The recording's episode from before the first reset is drawn, here as there.
+    env = next(e for e in map(make, range(10_000)) if e.state_dict()["_bound"][:, 0].equal(first))
+    for played in zip(*(run["episodes"] for run in runs), strict=True):
+        levels, lengths, target_lengths, returns = (
+            torch.tensor(x) for x in zip(*played, strict=True)
+        )
+        inputs = [
+            input_of(task, int(length), int(target_length))
+            for length, target_length in zip(lengths, target_lengths, strict=True)
+        ]
+        td = env.reset(as_instance(inputs, batch))
+        assert td["level"].flatten().tolist() == levels.tolist()
+        assert td["attainable"].flatten().tolist() == target_lengths.tolist()
+        total, targets = torch.zeros(len(runs)), env.state_dict()["_target"]
+        right_until = torch.where(returns == target_lengths, target_lengths, target_lengths - 1)
+        for t in range(int(target_lengths.max())):
+            character = (targets[:, t] + (t >= right_until)).clamp(min=0) % TASKS[task].base
+            action = torch.stack([character * 0, character * 0 + 1, character], -1)
+            active = ~td["done"].flatten()
+            if not active.any():
+                break
+            td = env.step(act(td, action, active))
+            total += td["next", "reward"].flatten()
+            td = env.step_mdp(td)
+        assert td["done"].all()
+        assert total.tolist() == returns.tolist()
+
+
+# Solvers that see what a policy sees: the character under the head. They yield actions.
+LEFT, RIGHT, UP, DOWN = range(4)
+Solver = Generator[Any, int, Any]
+
+
+def solve_copy(blank: int, rows: int) -> Solver:
+    seen = yield 0, 0, 0
+    while True:
+        seen = yield RIGHT, 1, seen
+
+
+def solve_duplicated_input(blank: int, rows: int) -> Solver:
+    seen = yield 0, 0, 0
+    while True:
+        seen = yield RIGHT, 1, seen
+        seen = yield RIGHT, 0, 0
+
+
+def walk(seen: int, move: int, write: int, blank: int) -> Solver:
+    """Go on until the tape ends, then turn back onto it."""
+    while seen != blank:
+        seen = yield move, write, seen
+    return (yield 1 - move, 0, 0)
+
+
+def solve_repeat_copy(blank: int, rows: int) -> Solver:
+    seen = yield 0, 0, 0
+    for move in (RIGHT, LEFT, RIGHT):
+        seen = yield from walk(seen, move, 1, blank)
+
+
+def solve_reverse(blank: int, rows: int) -> Solver:
+    seen = yield 0, 0, 0
+    seen = yield from walk(seen, RIGHT, 0, blank)
+    yield from walk(seen, LEFT, 1, blank)
+
+
+def solve_addition(blank: int, rows: int) -> Solver:
+    seen, carry, across = (yield 0, 0, 0), 0, DOWN
+    while seen != blank:
+        total = carry + seen
+        for _ in range(rows - 1):
+            total += yield across, 0, 0
+        carry, digit = divmod(total, blank)
+        seen, across = (yield RIGHT, 1, digit), UP + DOWN - across
+    yield RIGHT, 1, carry
+
+
+SOLVERS: dict[str, Callable[[int, int], Solver]] = {
+    "copy": solve_copy,
+    "duplicated_input": solve_duplicated_input,
+    "repeat_copy": solve_repeat_copy,
+    "reverse": solve_reverse,
+    "reversed_addition": solve_addition,
+    "reversed_addition3": solve_addition,
+}
+
+
+def play(env: AlgorithmicEnv, td: TensorDictBase) -> Tensor:
+    """The returns of the solver's episodes, from their start."""
+    task = env.task
+    solvers = [SOLVERS[env.task_name](task.base, task.rows) for _ in range(env.numel())]
+    for solver in solvers:
+        next(solver)
+    total = torch.zeros(env.batch_size)
+    while not (done := td["done"][..., 0]).all():
+        idle = (0, 0, 0)
+        actions = [
+            idle if ended else solver.send(seen)
+            for solver, seen, ended in zip(
+                solvers, td["observation"].flatten().tolist(), done.flatten().tolist(), strict=True
+            )
+        ]
+        td = env.step(act(td, torch.tensor(actions), ~done))
+        total += td["next", "reward"][..., 0]
+        td = env.step_mdp(td)
+    return total
+
+
+@pytest.mark.parametrize("min_length", [None, 30])
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_perfect_play_earns_what_is_attainable(task, min_length):
+    env = AlgorithmicEnv(task, num_groups=60, min_length=min_length, seed=0)
+    td = env.reset()
+    returns, attainable = play(env, td), td["attainable"]
+    if task == "reversed_addition3":
+        # Reading three rows takes three steps a column, the limit allows two and four more.
+        readable = attainable <= 3
+        assert returns[readable].equal(attainable[readable])
+        assert readable.any() == (min_length is None)
+        assert (returns < attainable)[attainable > 5].all()
+    else:
+        assert returns.equal(attainable)
+
+
+@pytest.mark.parametrize(
+    ("task", "mean"),
+    [
+        ("copy", 31),
+        ("duplicated_input", 46 / 3),
+        ("repeat_copy", 93),
+        ("reverse", 31),
+        ("reversed_addition", 31.5),
+    ],
+)
+def test_mean_attainable_at_the_last_level(task, mean):
+    env = AlgorithmicEnv(task, num_groups=5000, min_length=30, seed=0)
+    assert env.reset()["attainable"].mean().item() == pytest.approx(mean, rel=0.002)
+
+
+def read_tape(env: AlgorithmicEnv, columns: int) -> tuple[TensorDictBase, Tensor]:
+    """Reset, then read so many columns of the first row of the input."""
+    td, seen = env.reset(), []
+    start = td.clone()
+    for _ in range(columns):
+        seen.append(td["observation"])
+        td = env.step_mdp(env.step(act(td, torch.tensor([RIGHT, 0, 0]).expand(env.numel(), 3))))
+    return start, torch.stack(seen, -1)
+
+
+@pytest.mark.parametrize("task", ["copy", "reverse", "duplicated_input"])
+def test_lengths_and_characters_are_uniform(task):
+    count, base = 6000, TASKS[task].base
+    env = AlgorithmicEnv(task, num_groups=count, min_length=6, curriculum=None, seed=3)
+    start, tape = read_tape(env, 9)
+    length = (tape < base).sum(-1)[:, 0]
+    shares = (
+        {6: 2 / 3, 7: 0, 8: 1 / 3}
+        if task == "duplicated_input"
+        else dict.fromkeys((6, 7, 8), 1 / 3)
+    )
+    assert torch.isin(length, torch.tensor([*shares])).all()
+    for size, share in shares.items():
+        assert (length == size).float().mean().item() == pytest.approx(share, abs=0.03)
+    if task == "duplicated_input":
+        assert tape[..., :6:2].equal(tape[..., 1:6:2])
+        tape = tape[..., ::2]
+    pairs = (tape[..., 0] * base + tape[..., 2]).flatten()
+    frequency = torch.bincount(pairs, minlength=base**2) / count
+    spread = 5 * (1 / base**2 / count) ** 0.5
+    assert (frequency - 1 / base**2).abs().max() < spread
+    assert start["group"].unique().numel() == count
+
+
+def test_the_seed_decides_the_episodes():
+    def episodes(env: AlgorithmicEnv) -> Tensor:
+        return torch.stack([read_tape(env, 4)[1] for _ in range(3)])
+
+    make = partial(AlgorithmicEnv, "copy", num_groups=20, group_size=2)
+    env = make(seed=5)
+    first = episodes(env)
+    assert first[:, :, 0].equal(first[:, :, 1])
+    assert first.equal(episodes(make(seed=5)))
+    assert not first.equal(episodes(make(seed=6)))
+    assert not first.equal(episodes(env))
+    env.set_seed(5)
+    assert first.equal(episodes(env))
+    torch.manual_seed(0)
+    unseeded = episodes(make())
+    torch.manual_seed(0)
+    assert unseeded.equal(episodes(make()))
+
+
+def random_policy(env: AlgorithmicEnv, generator: torch.Generator) -> Tensor:
+    """Uniform actions that write now and then."""
+    count, base = env.numel(), env.task.base
+    moves = 2 if env.task.rows == 1 else 4
+    return torch.stack(
+        [
+            torch.randint(moves, (count,), generator=generator),
+            (torch.rand(count, generator=generator) < 0.3).long(),
+            torch.randint(base, (count,), generator=generator),
+        ],
+        -1,
+    )
+
+
+@pytest.mark.parametrize("curriculum", ["group", "batch", "gym", None])
+def test_copies_share_instances_when_they_are_reset_at_different_times(curriculum):
+    env = AlgorithmicEnv("copy", num_groups=4, group_size=3, curriculum=curriculum, seed=0)
+    generator = torch.Generator().manual_seed(0)
+    td, tapes = env.reset(), {}
+    played = [[[] for _ in range(3)] for _ in range(4)]
+    for _ in range(120):
+        tape = env.state_dict()["_tape"].view(4, 3, -1).clone()
+        for row in range(4):
+            for k in range(3):
+                group = int(td["group"][row, k])
+                if played[row][k][-1:] != [group]:
+                    played[row][k].append(group)
+                assert tapes.setdefault(group, tape[row, k]).equal(tape[row, k])
+        td = env.step_and_maybe_reset(act(td, random_policy(env, generator)))[1]
+    ids = set()
+    for row in played:
+        assert len({len(groups) for groups in row}) > 1, "the copies should have drifted apart"
+        common = min(map(len, row))
+        assert common > 5
+        assert row[0][:common] == row[1][:common] == row[2][:common]
+        own = {group for groups in row for group in groups}
+        assert not ids & own
+        ids |= own
+
+
+def partial_reset(env: AlgorithmicEnv, td: TensorDictBase, copies: Tensor) -> TensorDictBase:
+    return env.reset(td.clone().set("_reset", copies.unsqueeze(-1)))
+
+
+def test_a_copy_may_run_far_ahead_and_a_full_reset_brings_all_in_step():
+    env = AlgorithmicEnv("copy", num_groups=2, group_size=2, seed=1)
+    td = env.reset()
+    leader = torch.tensor([[True, False], [False, False]])
+    follower = torch.tensor([[False, True], [False, False]])
+
+    def advance(td: TensorDictBase, copies: Tensor) -> tuple[TensorDictBase, list]:
+        seen = []
+        for _ in range(11):
+            td = partial_reset(env, td, copies)
+            seen.append([td[key][copies].item() for key in ("group", "observation", "attainable")])
+        return td, seen
+
+    others = td["group"][1].clone()
+    td, ahead = advance(td, leader)
+    assert len({group for group, *_ in ahead}) == 11
+    td, behind = advance(td, follower)
+    assert behind == ahead
+    assert td["group"][1].equal(others)
+
+    td, _ = advance(td, leader)
+    td = env.reset()
+    assert td["group"][:, 0].equal(td["group"][:, 1])
+    assert td["group"].unique().numel() == 2
+
+
+@pytest.mark.parametrize("task", ["copy", "reversed_addition"])
+def test_partial_steps_leave_the_others_alone(task):
+    make = partial(AlgorithmicEnv, task, num_groups=5, group_size=4, min_length=20)
+    env, whole = make(), make()
+    generator = torch.Generator().manual_seed(1)
+    td, sizes, advance = env.reset(), [], env._advance
+
+    def counting(rows: Any, action: Tensor) -> Tensor:
+        sizes.append(action.shape[0])
+        return advance(rows, action)
+
+    env._advance = counting
+    for _ in range(12):
+        active = torch.rand(5, 4, generator=generator) < 0.4
+        actions = random_policy(env, generator) * torch.tensor([1, 0, 1])
+        before, head = td.clone(), env.read_head
+        whole.load_state_dict(env.state_dict())
+        stepped = whole.step(act(td.clone(), actions))["next"]
+        td = env.step(act(td, actions, active))
+        for key in ("observation", "previous_action", "group", "level", "attainable", "done"):
+            assert td["next", key][active].equal(stepped[key][active])
+            assert td["next", key][~active].equal(before[key][~active])
+        assert env.read_head[active].equal(whole.read_head[active])
+        assert env.read_head[~active].equal(head[~active])
+        assert not td["next", "reward"][~active].any()
+        assert sizes.pop() == active.sum()
+        td = env.step_mdp(td)
+
+
+def test_episodes_that_have_ended_stay_ended():
+    env = AlgorithmicEnv("copy", num_groups=2, seed=0)
+    td = env.reset(as_instance([[1, 2, 3], [4, 2, 3]], (2, 1))).exclude("instance")
+    rewards, dones = [], []
+    for character in (1, 2, 3, 4):
+        td = env.step(act(td, torch.tensor([RIGHT, 1, character]).expand(2, 3)))
+        rewards.append(td["next", "reward"].flatten().tolist())
+        dones.append(td["next", "done"].flatten().tolist())
+        td = env.step_mdp(td)
+    assert rewards == [[1.0, -0.5], [1.0, 0.0], [1.0, 0.0], [0.0, 0.0]]
+    assert dones == [[False, True], [False, True], [True, True], [True, True]]
+    assert env.read_head.flatten().tolist() == [3, 1]
+
+
+def test_rollouts_until_all_are_done():
+    env = AlgorithmicEnv("copy", num_groups=10, group_size=3, seed=0)
+    generator = torch.Generator().manual_seed(2)
+    rollout = env.rollout(
+        50,
+        lambda td: act(td, random_policy(env, generator)),
+        break_when_all_done=True,
+        break_when_any_done=False,
+    )
+    assert rollout["next", "done"][..., -1, :].all()
+    assert rollout.shape[-1] > 2
+    assert rollout["group"].equal(rollout["next", "group"])
+
+
+def finish(env: AlgorithmicEnv, td: TensorDictBase, perfect: Tensor) -> TensorDictBase:
+    """Play the Copy episodes to their end: perfectly, or with a mistake at once."""
+    while not (done := td["done"][..., 0]).all():
+        seen = td["observation"].clamp(max=4)
+        character = torch.where(perfect, seen, (seen + 1) % 5)
+        one = torch.ones_like(seen)
+        td = env.step_mdp(env.step(act(td, torch.stack([one, one, character], -1), ~done)))
+    return td
+
+
+def levels_after(env: AlgorithmicEnv, perfect: Tensor, episodes: int) -> Tensor:
+    """The levels that are drawn at, `[G, K]`, after so many episodes."""
+    td = env.reset()
+    for _ in range(episodes):
+        finish(env, td, perfect)
+        td = env.reset()
+    return td["level"]
+
+
+FIRST_COPY = torch.tensor([[True, False]] * 3)
+SECOND_COPY = ~FIRST_COPY
+LAST_ROW_FAILS = torch.tensor([[True, True], [True, True], [False, False]])
+
+
+@pytest.mark.parametrize(
+    ("curriculum", "perfect", "episodes", "levels"),
+    [
+        ("group", FIRST_COPY, 9, [[2, 2], [2, 2], [2, 2]]),
+        ("group", FIRST_COPY, 10, [[3, 3], [3, 3], [3, 3]]),
+        ("group", FIRST_COPY, 20, [[4, 4], [4, 4], [4, 4]]),
+        ("group", SECOND_COPY, 20, [[2, 2], [2, 2], [2, 2]]),
+        ("group", LAST_ROW_FAILS, 10, [[3, 3], [3, 3], [2, 2]]),
+        ("gym", FIRST_COPY, 10, [[3, 2], [3, 2], [3, 2]]),
+        ("gym", SECOND_COPY, 19, [[2, 3], [2, 3], [2, 3]]),
+        ("batch", FIRST_COPY, 3, [[2, 2], [2, 2], [2, 2]]),
+        ("batch", FIRST_COPY, 4, [[3, 3], [3, 3], [3, 3]]),
+        ("batch", FIRST_COPY, 8, [[4, 4], [4, 4], [4, 4]]),
+        ("batch", LAST_ROW_FAILS, 30, [[2, 2], [2, 2], [2, 2]]),
+        (None, FIRST_COPY | SECOND_COPY, 20, [[2, 2], [2, 2], [2, 2]]),
+    ],
+)
+def test_levels_rise_after_successes_in_a_row(curriculum, perfect, episodes, levels):
+    env = AlgorithmicEnv("copy", num_groups=3, group_size=2, curriculum=curriculum, seed=0)
+    assert levels_after(env, perfect, episodes).tolist() == levels
+
+
+def test_in_gyms_curriculum_copies_at_different_levels_play_different_groups():
+    env = AlgorithmicEnv("copy", num_groups=3, group_size=2, curriculum="gym", seed=0)
+    levels_after(env, FIRST_COPY, 10)
+    td, tape = read_tape(env, 5)
+    assert (td["group"][:, 0] != td["group"][:, 1]).all()
+    assert (td["attainable"][:, 0] - td["attainable"][:, 1]).tolist() == [1, 1, 1]
+    both = tape < 5
+    assert tape[:, 0][both[:, 1]].equal(tape[:, 1][both[:, 1]])
+    levels_after(env, SECOND_COPY, 10)
+    td, tape = read_tape(env, 5)
+    assert td["group"][:, 0].equal(td["group"][:, 1])
+    assert tape[:, 0].equal(tape[:, 1])
+
+
+def test_a_failure_starts_the_count_again():
+    env = AlgorithmicEnv("copy", seed=0)
+    right, wrong = torch.tensor([[True]]), torch.tensor([[False]])
+    assert levels_after(env, right, 9).item() == 2
+    assert levels_after(env, wrong, 1).item() == 2
+    assert levels_after(env, right, 9).item() == 2
+    assert levels_after(env, right, 1).item() == 3
+
+
+@pytest.mark.parametrize(("curriculum", "level"), [("group", 3), ("batch", 3), ("gym", 2)])
+def test_interrupted_episodes_count_in_gyms_curriculum_only(curriculum, level):
+    env = AlgorithmicEnv("copy", curriculum=curriculum, seed=0)
+    right = torch.tensor([[True]])
+    levels_after(env, right, 5)
+    env.reset()
+    assert levels_after(env, right, 5).item() == level
+
+
+def test_the_curriculum_ends_at_30():
+    env = AlgorithmicEnv("copy", min_length=29, seed=0)
+    right = torch.tensor([[True]])
+    assert [levels_after(env, right, 10).item() for _ in range(3)] == [30, 30, 30]
+
+
+def test_stale_instances_do_not_count():
+    env = AlgorithmicEnv("copy", group_size=2, seed=0)
+    both = torch.tensor([[True, True]])
+    follower = torch.tensor([[False, True]])
+    td = env.reset()
+    for _ in range(5):  # five instances, drawn at level 2, wait for the first copy
+        td = partial_reset(env, td, follower)
+    for episode in range(15):
+        td = partial_reset(env, finish(env, td, both), ~follower)
+        assert td["level"][0, 0] == (2 if episode < 9 else 3)
+    # Those of the 15 that counted: ten at level 2, then five at level 3.
+    assert env.curriculum.streaks.item() == 5
+
+
+CONTINUED = ("observation", "previous_action", "level", "attainable", "done", ("next", "reward"))
+
+
+@pytest.mark.parametrize("via", ["torch.save", "checkpoint"])
+@pytest.mark.parametrize("curriculum", ["group", "batch", "gym"])
+def test_a_restored_environment_goes_on_identically(curriculum, via, tmp_path):
+    make = partial(AlgorithmicEnv, "reverse", num_groups=3, group_size=2, curriculum=curriculum)
+    env, other = make(seed=0), make(seed=1)
+
+    def go_on(env: AlgorithmicEnv, td: TensorDictBase, steps: int) -> TensorDict:
+        generator = torch.Generator().manual_seed(steps)
+        result = []
+        for _ in range(steps):
+            stepped, td = env.step_and_maybe_reset(act(td, random_policy(env, generator)))
+            result.append(stepped)
+        return torch.stack(result)
+
+    go_on(env, env.reset(), 53)
+    assert env.state_dict()["_queue.level"].shape[1] > 1, "instances should be pending"
+    generator = torch.Generator().manual_seed(7)
+    td = env.step_and_maybe_reset(act(env.reset(), random_policy(env, generator)))[1]
+    for _ in range(20):
+        td = env.step_and_maybe_reset(act(td, random_policy(env, generator)))[1]
+    if via == "checkpoint":
+        adapter = StateDictCheckpointAdapter()
+        adapter.save(env, tmp_path, args=(), kwargs={})
+        adapter.load(other, tmp_path, map_location=None, tensor_load_kwargs={}, args=(), kwargs={})
+    else:
+        file = io.BytesIO()
+        torch.save(env.state_dict(), file)
+        file.seek(0)
+        other.load_state_dict(torch.load(file, weights_only=True))
+    twin = copy.deepcopy(env)
+    assert other.curriculum.levels.equal(env.curriculum.levels)
+    expected = go_on(env, td.clone(), 200)
+    for continued in (other, twin):
+        got = go_on(continued, td.clone(), 200)
+        for key in CONTINUED:
+            assert got[key].equal(expected[key]), key
+        assert got["group"][0].equal(expected["group"][0])
+        late = set(got["group"][-1].flatten().tolist())
+        assert not late & set(expected["group"].flatten().tolist())
+
+
+def test_given_instances_share_a_group_where_they_are_the_same():
+    env = AlgorithmicEnv("copy", num_groups=2, group_size=3, seed=0)
+    drawn = AlgorithmicEnv("copy", num_groups=2, group_size=3, seed=0)
+    inputs = [[1, 2], [1, 2], [1, 2, 3], [1, 2], [0], [0]]
+    td = env.reset(as_instance(inputs, (2, 3)))
+    (a, b, c), (d, e, f) = td["group"].tolist()
+    assert a == b
+    assert e == f
+    assert len({a, c, d, e}) == 4
+    assert td["attainable"].tolist() == [[2, 2, 3], [2, 1, 1]]
+    # The drawn instances are not used up, and other copies not disturbed.
+    some = torch.tensor([[False, True, False], [False, False, False]])
+    other = as_instance([[4]] * 6, (2, 3)).update(td.exclude("instance"))
+    td = partial_reset(env, other, some)
+    assert td["attainable"].tolist() == [[2, 1, 3], [2, 1, 1]]
+    assert td["observation"].tolist() == [[1, 4, 1], [1, 0, 0]]
+    for _ in range(3):
+        keys = ("observation", "attainable")
+        assert (env.reset().select(*keys) == drawn.reset().select(*keys)).all()
+
+
+def test_instances_are_given_through_wrappers():
+    instance = torch.tensor([[[1, 2, 3]], [[4, 4, -1]]])
+    make = partial(AlgorithmicEnv, "copy", num_groups=2)
+    for env in (make(), TransformedEnv(make(), RewardSum())):
+        assert env.reset(instance=instance)["attainable"].tolist() == [[3], [2]]
+    serial = SerialEnv(2, [make, make])
+    td = TensorDict({"instance": torch.stack([instance, instance.flip(0)])}, (2, 2, 1))
+    assert serial.reset(td)["observation"].tolist() == [[[1], [4]], [[4], [1]]]
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_specs(task):
+    env = AlgorithmicEnv(task, num_groups=3, group_size=2)
+    check_env_specs(env)
+    check_env_specs(env, break_when_any_done="both")
+    transformed = TransformedEnv(env, Compose(StepCounter(10), RewardSum()))
+    check_env_specs(transformed, break_when_any_done="both")
+    blank, moves = env.task.base, 2 if env.task.rows == 1 else 4
+    td = env.reset()
+    assert td["previous_action"].flatten(0, 1).unique(dim=0).tolist() == [[moves, 2, blank]]
+    assert env.action_spec.rand().shape == (3, 2, 3)
+    assert {key: td[key].dtype for key in ("observation", "group", "level", "attainable")} == {
+        "observation": torch.int64,
+        "group": torch.int64,
+        "level": torch.int64,
+        "attainable": torch.float32,
+    }
+
+
+def test_in_a_collector():
+    env = TransformedEnv(AlgorithmicEnv("reverse", num_groups=4, group_size=2, seed=0), RewardSum())
+    collector = Collector(
+        env, None, frames_per_batch=160, total_frames=320, auto_register_policy_transforms=False
+    )
+    batches = list(collector)
+    assert [batch.shape for batch in batches] == [(4, 2, 20)] * 2
+    for batch in batches:
+        done = batch["next", "done"][..., :-1, 0]
+        # A new trajectory is a new instance, and one instance lasts a trajectory.
+        assert (batch["group"][..., 1:] != batch["group"][..., :-1]).equal(done)
+        assert batch["episode_reward"].shape == (4, 2, 20, 1)
+    collector.shutdown()
+
+
+@pytest.mark.parametrize("batched", [SerialEnv, ParallelEnv])
+def test_in_batched_environments(batched):
+    makers = [
+        partial(AlgorithmicEnv, "copy", num_groups=3, group_size=2, seed=seed) for seed in (0, 1)
+    ]
+    options = {"mp_start_method": "fork"} if batched is ParallelEnv else {}
+    env = batched(2, makers, **options)
+    try:
+        first = env.reset()
+        assert first.batch_size == (2, 3, 2)
+        assert first["group"][..., 0].equal(first["group"][..., 1])
+        assert first["group"].unique().numel() == 6
+        for seed, part in enumerate(first["observation"]):
+            assert part.equal(makers[seed]().reset()["observation"])
+        rollout = env.rollout(20, break_when_any_done=False)
+        assert rollout.shape == (2, 3, 2, 20)
+        assert rollout["next", "done"].any()
+    finally:
+        env.close()
+
+
+def test_partial_steps_of_batched_environments():
+    # TorchRL lets a "_step" mask choose among workers, not within one.
+    env = SerialEnv(4, [partial(AlgorithmicEnv, "copy", seed=seed) for seed in range(4)])
+    rollout = env.rollout(30, break_when_any_done=False, break_when_all_done=True)
+    assert rollout["next", "done"][..., -1, :].all()
+    assert rollout.shape[-1] < 30
+
+
+def test_group_ids_are_unique():
+    allocator = GroupIdAllocator()
+    others = [GroupIdAllocator(), copy.deepcopy(allocator), copy.copy(allocator)]
+    ids = torch.cat([a.allocate(1000) for a in (allocator, *others, allocator)])
+    assert ids.dtype == torch.int64
+    assert ids.min() >= 0
+    assert ids.unique().numel() == 5000
+    # The counter of an allocator runs over without a repetition.
+    half = 1 << 23
+    starts = [allocator.allocate(2, stride=half // 2)[0].item() for _ in range(5)]
+    assert len(set(starts)) == 5
+    with pytest.raises(ValueError, match="at most 16777216 in one call, got 16777217"):
+        allocator.allocate((1 << 24) + 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "task"),
+    [("ReversedAddition", "reversed_addition"), ("DuplicatedInput-v0", "duplicated_input")],
+)
+def test_gyms_names_are_known(name, task):
+    assert AlgorithmicEnv(name).task_name == task
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"task": "sort"}, "Unknown task 'sort'.*copy, duplicated_input.*reversed_addition3"),
+        ({"num_groups": 0}, "num_groups must be at least 1, got 0"),
+        ({"group_size": -1}, "group_size must be at least 1, got -1"),
+        ({"min_length": 31}, r"min_length of copy must lie in 1\.\.30, got 31"),
+        (
+            {"task": "duplicated_input", "min_length": 1},
+            r"min_length of duplicated_input must lie in 2\.\.30, got 1",
+        ),
+        ({"curriculum": "row"}, "curriculum must be 'group', 'batch', 'gym' or None, got 'row'"),
+    ],
+)
+def test_bad_arguments_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        AlgorithmicEnv(**{"task": "copy", **arguments})
+
+
+@pytest.mark.parametrize(
+    ("task", "instance", "message"),
+    [
+        ("copy", torch.zeros(2, 3, dtype=torch.int64), r"shape \[1, 2, L\].*got \[2, 3\]"),
+        ("copy", torch.zeros(1, 2, 0, dtype=torch.int64), r"L in 1\.\.32, got \[1, 2, 0\]"),
+        ("copy", torch.zeros(1, 2, 33, dtype=torch.int64), r"L in 1\.\.32, got \[1, 2, 33\]"),
+        ("copy", torch.zeros(1, 2, 3), "dtype torch.int64, got torch.float32"),
+        ("copy", torch.tensor([[[1, 2], [5, 1]]]), r"characters in 0\.\.4, and -1 .* got 5"),
+        ("copy", torch.tensor([[[1, 2], [-2, 1]]]), r"characters in 0\.\.4, and -1 .* got -2"),
+        ("copy", torch.tensor([[[1, 2], [-1, -1]]]), "at least one character in each episode"),
+        ("copy", torch.tensor([[[1, 2, 0], [1, -1, 1]]]), "after its last column only"),
+        ("reversed_addition", torch.zeros(1, 2, 4, dtype=torch.int64), r"\[1, 2, L, 2\]"),
+        (
+            "reversed_addition",
+            torch.tensor([[[[1, 2], [0, -1]], [[1, 2], [0, 0]]]]),
+            "in all rows of the input alike",
+        ),
+        (
+            "reversed_addition",
+            torch.zeros(1, 2, 4, 3, dtype=torch.int64),
+            r"\[1, 2, L, 2\].*got \[1, 2, 4, 3\]",
+        ),
+        ("duplicated_input", torch.tensor([[[1, 1], [1, 2]]]), "each character twice"),
+        ("duplicated_input", torch.tensor([[[1, 1, 1], [1, 1, -1]]]), "each character twice"),
+    ],
+)
+def test_malformed_instances_are_refused(task, instance, message):
+    env = AlgorithmicEnv(task, group_size=2, seed=0)
+    before = env.state_dict()["_tape"].clone()
+    with pytest.raises(ValueError, match=message):
+        env._reset(TensorDict({"instance": instance}, []))
+    assert env.state_dict()["_tape"].equal(before)
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ([2, 0, 0], r"of copy must lie between \[0, 0, 0\] and \[1, 1, 4\], got \[2, 0, 0\]"),
+        ([0, 2, 0], r"got \[0, 2, 0\]"),
+        ([0, 0, 5], r"got \[0, 0, 5\]"),
+        ([0, -1, 0], r"got \[0, -1, 0\]"),
+        ([0, 0], r"int64 of shape \[1, 2, 3\], got torch.int64 of shape \[1, 2, 2\]"),
+        ([0.0, 0.0, 0.0], "int64 of shape .* got torch.float32"),
+    ],
+)
+def test_actions_outside_the_spec_are_refused(action, message):
+    env = AlgorithmicEnv("copy", group_size=2, seed=0)
+    td = env.reset()
+    td["action"] = torch.stack([torch.tensor(action) * 0, torch.tensor(action)]).unsqueeze(0)
+    with pytest.raises(ValueError, match=message):
+        env.step(td)
+
+
+def test_only_the_actions_that_are_taken_are_checked():
+    env = AlgorithmicEnv("copy", group_size=2, seed=0)
+    td = act(env.reset(), torch.tensor([[0, 0, 0], [9, 9, 9]]), torch.tensor([True, False]))
+    assert not env.step(td)["next", "done"].any()
+
+
+if __name__ == "__main__":
+    pytest.main([__file__])
