@@ -1,0 +1,185 @@
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from torchrl_ecpo.experiment import MetricsTable, Run, read_metrics
+from torchrl_ecpo.experiment.compare import find_runs, load_comparison
+from torchrl_ecpo.experiment.compare import main as compare
+from torchrl_ecpo.experiment.figures import smooth
+
+PNG = b"\x89PNG\r\n"
+
+
+def make_config(backend="csv", **entries):
+    logger = {"backend": backend, "project": "test", "wandb_mode": "offline"}
+    return OmegaConf.create({"seed": 3, "logger": logger, "loss": {"name": "ecpo"}, **entries})
+
+
+def make_run(directory, config=None):
+    directory.mkdir(parents=True, exist_ok=True)
+    return Run(
+        config or make_config(),
+        total=30,
+        unit="trajectories",
+        name="bandit/ecpo/seed_3",
+        shown=("return", "evaluation"),
+        plotted=("return", "evaluation"),
+        directory=directory,
+    )
+
+
+def record(run):
+    run.log({"return": 1.0}, step=10)
+    run.log({"return": 2.0, "evaluation": 5.0}, step=20)
+    run.log({"return": 4.0}, step=30)
+
+
+def test_a_run_leaves_config_versions_metrics_summary_and_picture(tmp_path, capsys):
+    with make_run(tmp_path) as run:
+        record(run)
+    assert OmegaConf.load(tmp_path / "config.yaml").seed == 3
+    versions = json.loads((tmp_path / "versions.json").read_text())
+    assert {"python", "torch", "torchrl", "torchrl-ecpo"} <= versions.keys()
+    metrics = read_metrics(tmp_path)
+    assert metrics["step"] == [10, 20, 30]
+    assert metrics["return"] == [1, 2, 4]
+    assert metrics["evaluation"][1] == 5
+    assert math.isnan(metrics["evaluation"][0])
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["finished"] is True
+    assert summary["trajectories"] == 30
+    assert (summary["return"], summary["evaluation"]) == (4, 5)
+    assert (tmp_path / "curve.png").read_bytes().startswith(PNG)
+    assert str(tmp_path / "curve.png") in capsys.readouterr().out
+
+
+def test_rows_are_on_disk_as_soon_as_they_are_logged(tmp_path):
+    run = make_run(tmp_path)
+    run.log({"return": 1.0}, step=10)
+    assert read_metrics(tmp_path)["return"] == [1]
+    run.__exit__(None, None, None)
+
+
+def test_an_interrupted_run_keeps_its_record_and_says_so(tmp_path):
+    with pytest.raises(KeyboardInterrupt), make_run(tmp_path) as run:
+        record(run)
+        raise KeyboardInterrupt
+    assert json.loads((tmp_path / "summary.json").read_text())["finished"] is False
+    assert len(read_metrics(tmp_path)["step"]) == 3
+    assert (tmp_path / "curve.png").exists()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_loss_that_is_not_finite_stops_the_run_and_is_recorded(tmp_path, value):
+    with pytest.raises(FloatingPointError, match=f"loss_actor is {value} at trajectories 20"):
+        with make_run(tmp_path) as run:
+            run.log({"loss_actor": 1.0}, step=10)
+            run.log({"loss_actor": value}, step=20)
+    assert len(read_metrics(tmp_path)["step"]) == 2
+
+
+@pytest.mark.parametrize("backend", ["tensorboard", "wandb"])
+def test_other_loggers_come_beside_the_record(tmp_path, backend, monkeypatch):
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    with make_run(tmp_path, make_config(backend)) as run:
+        record(run)
+    written = [path.name for path in tmp_path.rglob("*")]
+    pattern = {"tensorboard": "events.out.tfevents", "wandb": "offline-run"}[backend]
+    assert any(pattern in name for name in written), written
+    assert read_metrics(tmp_path)["return"] == [1, 2, 4]
+
+
+def test_no_logger_leaves_no_record_but_a_picture(tmp_path):
+    with make_run(tmp_path, make_config("none")) as run:
+        record(run)
+    assert (tmp_path / "curve.png").exists()
+    with pytest.raises(FileNotFoundError, match=r"no metrics\.csv in .*logger\.backend"):
+        read_metrics(tmp_path)
+
+
+def test_an_unknown_logger_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"logger\.backend must be one of .*'csv'.*got 'excel'"):
+        make_run(tmp_path, make_config("excel"))
+
+
+def test_table_in_memory_and_on_disk_agree(tmp_path):
+    table = MetricsTable(tmp_path / "metrics.csv")
+    table.log_metrics({"a": 1.5}, step=1)
+    table.log_metrics({"b": 2.5}, step=2)
+    assert table.rows == [{"step": 1, "a": 1.5}, {"step": 2, "b": 2.5}]
+    assert (tmp_path / "metrics.csv").read_text().split() == ["step,a,b", "1,1.5,", "2,,2.5"]
+
+
+def test_smooth_is_a_trailing_mean():
+    values = np.array([1.0, 3.0, 5.0, 11.0])
+    assert smooth(values, 0.5).tolist() == [1.0, 2.0, 4.0, 8.0]
+    assert smooth(values, 0.0).tolist() == values.tolist()
+
+
+@pytest.fixture
+def runs(tmp_path):
+    curves = {"ecpo": [(1.0, 3.0, 5.0), (1.0, 5.0, 7.0)], "urex": [(0.0, 1.0, 2.0)]}
+    for method, values in curves.items():
+        for seed, returns in enumerate(values):
+            config = make_config(loss={"name": method, "tau": 0.1 * (seed + 1)})
+            with make_run(tmp_path / method / str(seed), config) as run:
+                for i, value in enumerate(returns):
+                    run.log({"return": value}, step=10 * (i + 1))
+    return tmp_path
+
+
+def test_comparison_puts_the_runs_of_a_method_together(runs):
+    comparison = load_comparison(find_runs([runs]), "return", points=3)
+    steps, values = comparison.curves["ecpo"]
+    assert steps.tolist() == [10, 20, 30]
+    assert values.tolist() == [[1, 3, 5], [1, 5, 7]]
+    assert "| ecpo | 2 | 30 | 6.000 ± 1.000 | 5.000 |" in comparison.table()
+    assert "| urex | 1 | 30 | 2.000 | 2.000 |" in comparison.table()
+
+
+def test_comparison_takes_the_latest_value_at_or_before_a_step(runs):
+    _, values = load_comparison(find_runs([runs / "urex"]), "return", points=5).curves["urex"]
+    assert values.tolist() == [[0, 0, 1, 1, 2]]
+
+
+def test_comparison_tells_methods_apart_by_what_it_is_told(runs):
+    comparison = load_comparison(find_runs([runs]), "return", by=["loss.name", "loss.tau"])
+    assert set(comparison.curves) == {
+        "ecpo, loss.tau 0.1",
+        "ecpo, loss.tau 0.2",
+        "urex, loss.tau 0.1",
+    }
+
+
+def test_compare_prints_a_table_and_writes_picture_and_curves(runs, capsys):
+    output, table = runs / "picture.svg", runs / "curves.csv"
+    compare([str(runs), "--metric", "return", "--output", str(output), "--csv", str(table)])
+    printed = capsys.readouterr().out
+    assert "| ecpo | 2 |" in printed
+    assert str(output) in printed
+    assert "<svg" in output.read_text()
+    lines = table.read_text().splitlines()
+    assert lines[0] == "method,run,step,return"
+    assert lines[-1] == "urex,0,30,2"
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda runs: find_runs([runs / "nowhere"]), FileNotFoundError, "no run .*nowhere"),
+        (lambda runs: load_comparison(find_runs([runs]), "reward"), KeyError, "no metric 'reward'"),
+        (
+            lambda runs: load_comparison(find_runs([runs]), "return", by=["loss.kind"]),
+            KeyError,
+            "no entry 'loss.kind'",
+        ),
+    ],
+)
+def test_comparison_refuses_what_is_not_there(runs, make, error, message):
+    with pytest.raises(error, match=message):
+        make(runs)

@@ -1,0 +1,96 @@
+"""Each script is started as a user would start it, in a process and a directory of its own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from torchrl_ecpo.experiment import read_metrics
+
+ROOT = Path(__file__).parents[1]
+ECPO = ROOT / "sota-implementations/ecpo/ecpo.py"
+TINY = ("env.num_actions=30", "total_trajectories=60", "group_size=10")
+
+
+def start(directory, *overrides):
+    flags = [override for override in overrides if override.startswith("--")]
+    options = [override for override in overrides if override not in flags]
+    command = [sys.executable, str(ECPO), *flags, *TINY, *options]
+    return subprocess.run(command, capture_output=True, text=True, cwd=directory, check=False)
+
+
+def run_ecpo(directory, *overrides):
+    process = start(directory, *overrides)
+    assert process.returncode == 0, process.stderr
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory):
+    """Every loss, by one start of the script."""
+    directory = tmp_path_factory.mktemp("sweep")
+    run_ecpo(
+        directory,
+        "--multirun",
+        "loss=ecpo,pmd,pmd_entropy,urex,ment",
+        "seed=5",
+        "project_steps=3",
+        f"hydra.sweep.dir={directory}",
+        "hydra.sweep.subdir=${loss.name}",
+    )
+    return directory
+
+
+@pytest.mark.parametrize("loss", ["ecpo", "pmd", "pmd_entropy", "urex", "ment"])
+def test_every_loss_trains_on_the_bandit(sweep, loss):
+    run = sweep / loss
+    metrics = read_metrics(run)
+    assert metrics["step"] == [10, 20, 30, 40, 50, 60]
+    assert json.loads((run / "summary.json").read_text())["finished"] is True
+    assert OmegaConf.load(run / "config.yaml").loss.name == loss
+    assert (run / "curve.png").exists()
+    # Trajectories 1 to 30 and 31 to 60 are of one reference each: right after a lift the policy
+    # is the reference, then it moves away.
+    kl = metrics["kl_to_reference"]
+    assert kl[0] == kl[3] == 0
+    assert all(kl[i] != 0 for i in (1, 2, 4, 5))
+
+
+def test_the_same_seed_gives_the_same_run_in_another_process(sweep, tmp_path):
+    run_ecpo(tmp_path, "seed=5", "project_steps=3", f"hydra.run.dir={tmp_path}")
+    assert read_metrics(tmp_path) == read_metrics(sweep / "ecpo")
+
+
+def test_seeds_are_other_problems_and_schedules_and_ablations_are_options(sweep, tmp_path):
+    run_ecpo(
+        tmp_path,
+        "--multirun",
+        "seed=6",
+        "project_steps=1",
+        "loss.tau_prime={schedule:linear,start:0.5,end:0.0,duration:40},0",
+        f"hydra.sweep.dir={tmp_path}",
+        "hydra.sweep.subdir=${hydra:job.num}",
+    )
+    scheduled, without_entropy = read_metrics(tmp_path / "0"), read_metrics(tmp_path / "1")
+    assert scheduled["expected_reward"][0] != read_metrics(sweep / "ecpo")["expected_reward"][0]
+    assert scheduled["tau_prime"] == pytest.approx([0.5, 0.375, 0.25, 0.125, 0, 0])
+    assert set(without_entropy["tau_prime"]) == {0}
+    assert set(without_entropy["kl_to_reference"]) == {0}, "one step a lift: no projection"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["env=chess"], "Could not find 'env/chess'"),
+        (["loss.tau=-1"], "tau must be a finite number >= 0, got -1"),
+        (["group_size=1"], "K >= 2 trajectories"),
+    ],
+)
+def test_bad_options_end_with_a_clear_message(tmp_path, overrides, message):
+    process = start(tmp_path, *overrides)
+    assert process.returncode != 0
+    assert message in process.stderr

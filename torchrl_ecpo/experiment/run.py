@@ -1,0 +1,236 @@
+"""One training run: its directory, its record, its progress bar and its picture."""
+
+from __future__ import annotations
+
+import csv
+import importlib.metadata
+import json
+import math
+import platform
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.record.loggers import Logger, get_logger
+from tqdm import tqdm
+
+from torchrl_ecpo.experiment.figures import plot_learning_curve
+
+__all__ = ["METRICS_FILE", "MetricsTable", "Run", "read_metrics"]
+
+METRICS_FILE = "metrics.csv"
+BACKENDS = ("csv", "tensorboard", "wandb", "none")
+RECORDED_PACKAGES = ("torchrl-ecpo", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
+
+Metrics = Mapping[str, float | Tensor]
+
+
+class MetricsTable:
+    """The record of a run: one csv table, a row for each logged step, written at once.
+
+    TorchRL's ``CSVLogger`` writes a file without a header for each scalar; a run is easier to read,
+    to commit and to continue as one table.
+
+    Args:
+        path: of the csv file; None keeps the rows in memory only.
+
+    Examples:
+        >>> table = MetricsTable(None)
+        >>> table.log_metrics({"return": 1.0}, step=10)
+        >>> table.log_metrics({"return": 2.0, "evaluation": 3.0}, step=20)
+        >>> table.rows
+        [{'step': 10, 'return': 1.0}, {'step': 20, 'return': 2.0, 'evaluation': 3.0}]
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self.path = path
+        self.rows: list[dict[str, float]] = []
+        self._columns: list[str] = []
+
+    def log_metrics(self, metrics: Mapping[str, float], step: int) -> None:
+        """Append a row. A new column rewrites the file, with empty cells in earlier rows."""
+        row = {"step": step, **metrics}
+        self.rows.append(row)
+        if self.path is None:
+            return
+        is_wider = any(name not in self._columns for name in row)
+        if is_wider:
+            self._columns += [name for name in row if name not in self._columns]
+        with self.path.open("w" if is_wider else "a", newline="") as file:
+            writer = csv.DictWriter(file, self._columns)
+            if is_wider:
+                writer.writeheader()
+            writer.writerows(self.rows if is_wider else [row])
+
+
+def read_metrics(run_directory: Path | str) -> dict[str, list[float]]:
+    """Read the record of a run: a column of numbers for each metric, NaN where a cell is empty.
+
+    Args:
+        run_directory: of a run, or of any folder with its ``metrics.csv``.
+
+    Raises:
+        FileNotFoundError: if there is no record.
+    """
+    path = Path(run_directory) / METRICS_FILE
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"There is no {METRICS_FILE} in {run_directory}: is it the directory of a run, and was "
+            "the run made with a logger.backend other than 'none'?"
+        )
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    names = rows[0] if rows else []
+    return {name: [float(row[name] or "nan") for row in rows] for name in names}
+
+
+class Run:
+    """A training run in the current directory: record, loggers, progress bar, picture.
+
+    Writes ``config.yaml``, ``versions.json``, ``metrics.csv`` as it goes, and at the end
+    ``summary.json`` and ``curve.png``. Use it as a context manager; a run that is interrupted keeps
+    its record and still draws its picture.
+
+    Args:
+        config: the composed configuration; needs ``seed`` and ``logger`` with ``backend``
+            (``csv``: the record alone; ``tensorboard`` or ``wandb``: that too; ``none``: no
+            record), ``project`` and ``wandb_mode``.
+
+    Keyword Args:
+        total: number of steps of the run, for the progress bar.
+        unit: what a step is, for the bar and the picture's axis.
+        name: of the run, in titles and loggers.
+        shown: metrics that the progress bar shows.
+        plotted: metrics that the picture shows, a panel each.
+        directory: where to write; defaults to the working directory.
+
+    Raises:
+        ValueError: for an unknown backend.
+    """
+
+    def __init__(
+        self,
+        config: DictConfig,
+        *,
+        total: int,
+        unit: str,
+        name: str,
+        shown: Sequence[str],
+        plotted: Sequence[str],
+        directory: Path | str = ".",
+    ) -> None:
+        backend = config.logger.backend
+        if backend not in BACKENDS:
+            raise ValueError(f"logger.backend must be one of {BACKENDS}, got {backend!r}.")
+        self.name, self.unit, self.shown, self.plotted = name, unit, shown, plotted
+        self.directory = Path(directory).resolve()
+        self.step = 0
+        self._latest: dict[str, float] = {}
+        OmegaConf.save(config, self.directory / "config.yaml", resolve=True)
+        _write_json(self.directory / "versions.json", _versions())
+        self.table = MetricsTable(None if backend == "none" else self.directory / METRICS_FILE)
+        self._logger = self._make_logger(config, backend)
+        self._bar = tqdm(
+            total=total,
+            unit=f" {unit}",
+            desc=name,
+            # A log file gets a line now and then, a terminal a lively bar.
+            mininterval=0.5 if sys.stderr.isatty() else 30.0,
+        )
+        self._started = time.monotonic()
+
+    def _make_logger(self, config: DictConfig, backend: str) -> Logger | None:
+        if backend not in ("tensorboard", "wandb"):
+            return None
+        logger = get_logger(
+            backend,
+            logger_name=str(self.directory),
+            experiment_name=self.name.replace("/", "_"),
+            wandb_kwargs={"project": config.logger.project, "mode": config.logger.wandb_mode},
+        )
+        assert logger is not None
+        logger.log_hparams(_flatten(OmegaConf.to_container(config, resolve=True)))
+        return logger
+
+    def log(self, metrics: Metrics | TensorDictBase, step: int) -> None:
+        """Record the metrics of a step, whose number must grow.
+
+        Raises:
+            FloatingPointError: if a loss is NaN or infinite; what was recorded stays.
+        """
+        values = {str(name): float(value) for name, value in metrics.items()}
+        self.table.log_metrics(values, step)
+        if self._logger is not None:
+            self._logger.log_metrics(values, step)
+        # Metrics that are not measured at every step stay on the bar as they last were.
+        self._latest.update(values)
+        shown = {name: f"{self._latest[name]:.3g}" for name in self.shown if name in self._latest}
+        self._bar.set_postfix(shown, refresh=False)
+        self._bar.update(step - self.step)
+        self.step = step
+        for name, value in values.items():
+            if name.startswith("loss") and not math.isfinite(value):
+                raise FloatingPointError(
+                    f"{name} is {value} at {self.unit} {step}: the run stops before the parameters "
+                    "are spoilt further. A lower learning rate or a higher temperature may help."
+                )
+
+    def __enter__(self) -> Run:
+        """Return the run itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Close the bar and the loggers; write the summary and the picture, also after an error."""
+        self._bar.close()
+        if self._logger is not None:
+            self._logger.close()
+        if not self.table.rows:
+            return
+        summary = {
+            "finished": error is None,
+            "seconds": round(time.monotonic() - self._started, 1),
+            self.unit: self.step,
+            **{k: value if math.isfinite(value) else None for k, value in self._latest.items()},
+        }
+        _write_json(self.directory / "summary.json", summary)
+        picture = plot_learning_curve(
+            self.table.rows,
+            self.directory / "curve.png",
+            metrics=self.plotted,
+            title=self.name,
+            x_label=self.unit,
+        )
+        print(f"{self.name}: learning curve in {picture}")
+
+
+def _flatten(config: object, prefix: str = "") -> dict[str, float | str]:
+    """A nested configuration as ``{"loss.tau": 0.5, ...}``, which is all TensorBoard takes."""
+    if isinstance(config, Mapping):
+        parts = (_flatten(value, f"{prefix}.{name}") for name, value in config.items())
+        return {name: value for part in parts for name, value in part.items()}
+    is_plain = isinstance(config, (bool, int, float, str))
+    return {prefix.removeprefix("."): config if is_plain else str(config)}
+
+
+def _versions() -> dict[str, str]:
+    versions = {"python": platform.python_version(), "platform": platform.platform()}
+    for package in RECORDED_PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = "not installed"
+    return versions
+
+
+def _write_json(path: Path, content: Mapping[str, object]) -> None:
+    path.write_text(json.dumps(content, indent=2) + "\n")
