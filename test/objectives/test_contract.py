@@ -1,0 +1,509 @@
+"""What TorchRL asks of a LossModule, asked of every group loss."""
+
+from __future__ import annotations
+
+import inspect
+import pickle
+import warnings
+from copy import deepcopy
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictParams
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    set_composite_lp_aggregate,
+)
+from torch.distributions import Categorical
+from torch.testing import assert_close
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
+from torchrl.modules import ProbabilisticActor, set_recurrent_mode
+from torchrl.modules.tensordict_module.rnn import recurrent_mode
+from torchrl.objectives import HardUpdate, LossModule, SoftUpdate, ValueEstimators
+from trajectory_problems import (
+    ACTOR_KEYS,
+    CASES,
+    LIFTING,
+    MASK,
+    as_keywords,
+    gradients,
+    make_actor,
+    move,
+    pad,
+    sample,
+)
+
+losses = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+lifting = pytest.mark.parametrize("case", [CASES[n] for n in LIFTING], ids=LIFTING)
+OUT_KEYS = [
+    "loss_actor",
+    "ESS",
+    "max_weight",
+    "kl_to_reference",
+    "entropy",
+    "return",
+    "equal_return_groups",
+]
+
+
+def build(case, kind="categorical", **kwargs):
+    """A loss with a delayed reference policy where the loss can have one, and an updater."""
+    delayed = case in [CASES[name] for name in LIFTING]
+    loss = case.build(make_actor(kind), **({"delay_actor": True} if delayed else {}), **kwargs)
+    loss.set_keys(**ACTOR_KEYS.get(kind, {}))
+    if delayed:
+        SoftUpdate(loss, eps=0.9)
+    return loss
+
+
+# -------------------------------------------------------------------------------------------- keys
+
+RENAMED = {
+    "flat": {"action": "deed", "reward": "prize", "sample_log_prob": "log_prob"},
+    "nested": {
+        "action": ("agents", "deed"),
+        "reward": ("agents", "the_prize"),
+        "sample_log_prob": ("agents", "log_prob"),
+    },
+}
+DEFAULTS = {"action": "action", "reward": "reward", "sample_log_prob": "action_log_prob"}
+
+
+def _at(field, key):
+    """Where the entry of a field is."""
+    if field != "reward":
+        return key
+    return ("next", *((key,) if isinstance(key, str) else key))
+
+
+def _rename(batch, keys):
+    renamed = batch.exclude(*(_at(f, DEFAULTS[f]) for f in keys))
+    for name, key in keys.items():
+        renamed[_at(name, key)] = batch[_at(name, DEFAULTS[name])]
+    return renamed
+
+
+@losses
+def test_default_keys(case):
+    """As documented, in this order: with sets it would depend on the seed of the hashes."""
+    loss = build(case)
+    assert {f: getattr(loss.tensor_keys, f) for f in DEFAULTS} == DEFAULTS
+    rest = ["action", ("next", "reward"), "action_log_prob", MASK]
+    assert loss.in_keys == ["observation", *rest]
+    recurrent = ["observation", "recurrent_state_h", "recurrent_state_c", "is_init"]
+    assert build(case, "lstm").in_keys == [*recurrent, *rest]
+    assert loss.out_keys == OUT_KEYS
+    with set_composite_lp_aggregate(True):
+        assert build(case).tensor_keys.sample_log_prob == "sample_log_prob"
+
+
+@losses
+@pytest.mark.parametrize("names", RENAMED)
+@pytest.mark.parametrize(
+    "fields", [["action"], ["reward"], ["sample_log_prob"], [*DEFAULTS]], ids=str
+)
+def test_set_keys(case, names, fields):
+    """Every field, one at a time and all at once; None restores the default."""
+    batch = pad(sample(make_actor(), 2, 3, 4))
+    expected = build(case)(batch)
+    keys = {name: RENAMED[names][name] for name in fields}
+    loss = build(case)
+    assert loss.in_keys
+    assert loss.set_keys(**keys) is None
+    assert [getattr(loss.tensor_keys, name) for name in fields] == list(keys.values())
+    assert {_at(name, key) for name, key in keys.items()} <= set(loss.in_keys)
+    assert_close(loss(_rename(batch, keys)), expected)
+    assert len(loss(**as_keywords(loss, _rename(batch, keys)))) == len(OUT_KEYS)
+    loss.set_keys(**dict.fromkeys(fields))
+    assert loss.in_keys == build(case).in_keys
+    assert_close(loss(batch), expected)
+
+
+@losses
+def test_unknown_key(case):
+    """TorchRL's own ValueError."""
+    with pytest.raises(ValueError, match="value is not an accepted tensordict key"):
+        build(case).set_keys(value="value")
+
+
+@losses
+def test_keys_of_one_loss_are_its_own(case):
+    """Renaming in one leaves another alone."""
+    first, second = build(case), build(case)
+    first.set_keys(action="deed")
+    assert second.tensor_keys.action == "action"
+
+
+@losses
+def test_in_keys_can_be_given(case):
+    """The property has a setter, as TorchRL's have; set_keys makes them anew."""
+    loss = build(case)
+    keys = loss.in_keys
+    loss.in_keys = ["observation"]
+    assert loss.in_keys == ["observation"]
+    loss.set_keys(action="action")
+    assert loss.in_keys == keys
+
+
+@losses
+@pytest.mark.parametrize("kind", ["categorical", "composite", "lstm"])
+@pytest.mark.parametrize("padded", [False, True], ids=["whole", "padded"])
+def test_call_without_tensordict(case, kind, padded):
+    """Keywords are the in_keys joined by _, the tuple is in the order of out_keys."""
+    batch = sample(make_actor(kind), 2, 3, 4)
+    batch = pad(batch) if padded else batch
+    loss = build(case, kind)
+    expected = loss(batch)
+    keywords = as_keywords(loss, batch)
+    assert ("collector_mask" in keywords) is padded
+    values = loss(**keywords)
+    assert len(values) == len(OUT_KEYS)
+    for name, value in zip(loss.out_keys, values, strict=True):
+        assert_close(value, expected[name], msg=name)
+
+
+@losses
+def test_call_without_tensordict_and_without_a_keyword(case):
+    """The entry is named."""
+    loss = build(case)
+    keywords = as_keywords(loss, sample(make_actor(), 2, 3, 4))
+    del keywords["next_reward"]
+    with pytest.raises(KeyError, match=r"\('next', 'reward'\) is missing"):
+        loss(**keywords)
+
+
+@losses
+def test_select_out_keys(case):
+    """One, two, all."""
+    batch = sample(make_actor(), 2, 3, 4)
+    loss = build(case)
+    expected = loss(batch)
+    loss.select_out_keys("loss_actor")
+    assert list(loss(batch).keys()) == ["loss_actor"]
+    assert_close(loss(**as_keywords(loss, batch)), expected["loss_actor"])
+    assert loss.reset_out_keys() is loss
+    assert loss.select_out_keys("return", "loss_actor") is loss
+    assert list(loss(batch).keys()) == ["return", "loss_actor"]
+    mean_return, value = loss(**as_keywords(loss, batch))
+    assert_close(value, expected["loss_actor"])
+    assert_close(mean_return, expected["return"])
+    loss.reset_out_keys()
+    assert loss.out_keys == OUT_KEYS
+    assert_close(loss(batch), expected)
+    assert build(case).out_keys == OUT_KEYS
+    for unknown in (["bogus"], ["loss_actor", "bogus"], []):
+        with pytest.raises(ValueError, match=r"out_keys \['loss_actor'.*got"):
+            loss.select_out_keys(*unknown)
+
+
+@losses
+@pytest.mark.parametrize("kind", ["categorical", "composite", "lstm"])
+@pytest.mark.parametrize("shape", [(3, 4), (2, 3, 4)], ids=str)
+def test_input_is_untouched(case, kind, shape):
+    """No new entry, no changed value, at any depth; also not where the actor would write."""
+    actor = make_actor(kind)
+    batch = pad(sample(actor, *shape))
+    with set_recurrent_mode(True), torch.no_grad():
+        batch.update(actor.get_dist_params(batch.clone()))
+    for batch_size in (shape, shape[:1], ()):
+        given = TensorDict(batch.to_dict(), batch_size=batch_size)
+        before = given.clone()
+        build(case, kind)(given)
+        assert set(given.keys(True)) == set(before.keys(True))
+        assert_close(given, before, equal_nan=True, rtol=0, atol=0)
+        for key in given.keys(True):
+            assert given.get(key).shape == before.get(key).shape, key
+
+
+# -------------------------------------------------------------------------------------- the module
+
+
+@losses
+@pytest.mark.parametrize("kind", ["categorical", "composite", "lstm"])
+def test_every_parameter_gets_a_gradient_and_no_target_does(case, kind):
+    """And nothing is listed twice."""
+    loss = build(case, kind)
+    move(loss.actor_network)
+    loss(sample(make_actor(kind), 2, 3, 4))["loss_actor"].backward()
+    names = [name for name, _ in loss.named_parameters()]
+    assert names
+    assert not any("target" in name for name in names)
+    for name, parameter in loss.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.norm() > 0, name
+    tensors = [*loss.parameters(), *loss.buffers()]
+    assert len({id(t) for t in tensors}) == len(tensors)
+    for target in loss.target_actor_network_params.values(True, True):
+        assert not target.requires_grad
+        assert target.grad is None
+
+
+@losses
+def test_parameters_are_the_users(case):
+    """Changed in place, they change the actor that was passed in; the actor's change the loss."""
+    actor = make_actor()
+    loss = case.build(actor)
+    for parameter in loss.parameters():
+        parameter.data.fill_(0.5)
+    assert all((parameter == 0.5).all() for parameter in actor.parameters())
+    assert {id(p) for p in loss.parameters()} == {id(p) for p in actor.parameters()}
+
+
+@losses
+def test_deepcopy_shares_nothing(case):
+    """Neither memory nor temperatures nor keys."""
+    loss = build(case)
+    batch = sample(make_actor(), 2, 3, 4)
+    expected = loss(batch)
+    copy = deepcopy(loss)
+    assert_close(copy(batch), expected)
+    tensors = {t.data_ptr() for t in [*loss.parameters(), *loss.buffers()]}
+    assert not tensors & {t.data_ptr() for t in [*copy.parameters(), *copy.buffers()]}
+    copy.tau = 0.01
+    copy.set_keys(action="deed")
+    move(copy.actor_network)
+    copy.actor_network_params.data.mul_(2.0)
+    assert_close(loss(batch), expected)
+
+
+@losses
+def test_pickle(case):
+    """A loss can be sent to another process."""
+    loss = build(case)
+    batch = sample(make_actor(), 2, 3, 4)
+    assert_close(
+        pickle.loads(pickle.dumps(case.build(make_actor())))(batch)["return"], loss(batch)["return"]
+    )
+
+
+@losses
+def test_state_dict_round_trip(case):
+    """Strict, into a loss built alike: parameters, target, temperatures; also after a forward."""
+    batch = sample(make_actor(), 2, 3, 4)
+    loss = build(case)
+    entries = set(loss.state_dict())
+    assert set(case.temperatures) <= entries
+    move(loss.actor_network)
+    for name in case.temperatures:
+        setattr(loss, name, 0.123)
+    expected = loss(batch)
+    assert loss.in_keys
+    assert loss.out_keys
+    assert set(loss.state_dict()) == entries
+    fresh = build(case)
+    assert not torch.allclose(fresh(batch)["loss_actor"], expected["loss_actor"])
+    fresh.load_state_dict(loss.state_dict(), strict=True)
+    assert_close(fresh(batch), expected)
+
+
+@losses
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64], ids=str)
+def test_to_dtype(case, dtype):
+    """Parameters, targets and temperatures follow, and keep their kind."""
+    loss = build(case)
+    for cast in (loss.to(dtype), loss.half().to(dtype)):
+        assert {t.dtype for t in [*cast.parameters(), *cast.buffers()]} == {dtype}
+        assert isinstance(cast.actor_network_params, TensorDictParams)
+        assert len(list(cast.parameters())) == 2
+        assert all(isinstance(p, torch.nn.Parameter) for p in cast.parameters())
+
+
+@losses
+def test_reset_parameters_recursive(case):
+    """Sources and targets both, as TorchRL's test of every loss demands."""
+    loss = build(case)
+    before = loss.state_dict()
+    before = {name: value.clone() for name, value in before.items() if "params" in name}
+    loss.reset_parameters_recursive()
+    after = loss.state_dict()
+    changed = [
+        name for name, value in before.items() if value.numel() and (value != after[name]).any()
+    ]
+    tensors = [name for name, value in before.items() if value.numel()]
+    assert changed == tensors
+    assert any("target" in name for name in tensors) is loss.delay_actor
+
+
+@losses
+def test_stateful_net(case):
+    """A working actor comes out, a copy by default, and its parameters go back in."""
+    loss = build(case)
+    net = loss.get_stateful_net("actor_network")
+    assert isinstance(net, ProbabilisticTensorDictSequential)
+    batch = sample(make_actor(), 2, 3, 4)
+    assert_close(
+        net.get_dist(batch.clone()).log_prob(batch["action"]).detach(), batch["action_log_prob"]
+    )
+    other = make_actor()
+    move(other)
+    loss.from_stateful_net("actor_network", other)
+    assert_close(list(loss.parameters()), list(other.parameters()))
+    assert loss.get_stateful_net("actor_network", copy=False) is loss.actor_network
+
+
+@losses
+def test_schedule_by_assignment(case):
+    """loss.tau = x writes into the buffer: same tensor, dtype and place; the next call uses it."""
+    loss = case.build(make_actor())
+    batch = sample(make_actor(), 2, 3, 4)
+    move(loss.actor_network)
+    for name in case.temperatures:
+        before = loss(batch)["loss_actor"]
+        buffer = getattr(loss, name)
+        setattr(loss, name, 2)
+        assert getattr(loss, name) is buffer
+        assert dict(loss.named_buffers())[name] is buffer
+        assert (buffer.item(), buffer.dtype, buffer.shape) == (2.0, torch.float64, torch.Size([]))
+        assert not torch.allclose(loss(batch)["loss_actor"], before)
+
+
+@losses
+def test_temperatures_travel_with_a_compiled_or_moved_module(case):
+    """They are buffers, not parameters."""
+    loss = case.build(make_actor())
+    assert set(case.temperatures) <= set(dict(loss.named_buffers()))
+    assert not set(case.temperatures) & set(dict(loss.named_parameters()))
+    assert type(loss)._schedulable_buffers == frozenset(case.temperatures)
+
+
+# ------------------------------------------------------------------------------------- the targets
+
+
+@lifting
+def test_delay_flag(case):
+    """With it the target stays where it was, without it the target is the live policy."""
+    for delayed in (True, False):
+        loss = case.build(make_actor(), delay_actor=delayed)
+        if delayed:
+            HardUpdate(loss, value_network_update_interval=1)
+        move(loss.actor_network)
+        source = loss.actor_network_params["module", "0", "module", "0", "weight"]
+        target = loss.target_actor_network_params["module", "0", "module", "0", "weight"]
+        assert torch.equal(source, target) is not delayed
+        assert ("target_actor_network_params" in dict(loss.named_children())) is delayed
+
+
+@lifting
+def test_warning_without_an_updater(case):
+    """TorchRL's own, until any updater is built; a loss without targets never warns."""
+    batch = sample(make_actor(), 2, 3, 4)
+    with pytest.warns(UserWarning, match="No target network updater has been associated"):
+        case.build(make_actor(), delay_actor=True)(batch)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        loss = case.build(make_actor(), delay_actor=True)
+        SoftUpdate(loss, eps=0.9)
+        loss(batch)
+
+
+@losses
+def test_no_warning_without_targets(case):
+    """Built, called, trained and copied in silence; a stock updater says there are no targets."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        loss = case.build(make_actor())
+        deepcopy(loss)(sample(make_actor(), 2, 3, 4))["loss_actor"].backward()
+    with pytest.raises(RuntimeError, match="not find any target param"):
+        SoftUpdate(loss, eps=0.9)
+
+
+# ------------------------------------------------------------------------- what a group loss is not
+
+
+@losses
+def test_no_value_estimator(case):
+    """Returns are sums of rewards: there is nothing to estimate and no discount."""
+    loss = case.build(make_actor())
+    for value_type in (None, *ValueEstimators):
+        with pytest.raises(NotImplementedError):
+            loss.make_value_estimator(value_type)
+    for name in ("gamma", "lmbda", "action_key"):
+        with pytest.raises(TypeError, match=name):
+            case.loss(make_actor(), **{name: 0.9})
+
+
+@losses
+def test_constructor(case):
+    """The network first, everything else by keyword; what the class says is what it has."""
+    parameters = list(inspect.signature(case.loss.__init__).parameters.values())[1:]
+    assert parameters[0].name == "actor_network"
+    assert all(p.kind is p.KEYWORD_ONLY for p in parameters[1:])
+    doc = inspect.getdoc(case.loss) or ""
+    assert all(f"{p.name}:" in doc for p in parameters)
+    assert issubclass(case.loss, LossModule)
+
+
+class _Spy(torch.nn.Module):
+    """Remembers in which modes it was called."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = torch.nn.Linear(3, 4)
+        self.modes = []
+
+    def forward(self, observation):
+        self.modes.append((exploration_type(), recurrent_mode()))
+        return self.linear(observation)
+
+
+@losses
+def test_modes_inside_and_after(case):
+    """Deterministic and recurrent inside; outside what it was before, also after an error."""
+    spy = _Spy().double()
+    network = TensorDictModule(spy, ["observation"], ["logits"])
+    loss = case.build(
+        ProbabilisticActor(network, in_keys=["logits"], distribution_class=Categorical)
+    )
+    batch = sample(make_actor(), 2, 3, 4)
+    with set_exploration_type(ExplorationType.RANDOM), set_recurrent_mode(False):
+        loss(batch)
+        with pytest.raises(KeyError):
+            loss(batch.exclude("action"))
+        assert exploration_type() is ExplorationType.RANDOM
+        assert recurrent_mode() is False
+    assert set(spy.modes) == {(ExplorationType.DETERMINISTIC, True)}
+
+
+# ----------------------------------------------------------------------------------------- compile
+
+
+def compiler_warnings(test):
+    """Tensordict and torch warn of their own ways into the compiler."""
+    for category in ("FutureWarning", "DeprecationWarning"):
+        test = pytest.mark.filterwarnings(f"ignore::{category}")(test)
+    return test
+
+
+def _assert_compiled_is_eager(case, backend):
+    """Same numbers and gradients, without a graph break, and one compilation for a whole run."""
+    torch._dynamo.reset()
+    loss, batch = build(case), pad(sample(make_actor(), 2, 3, 4))
+    compiled = torch.compile(loss, fullgraph=True, backend=backend)
+    for step in range(3):
+        expected, got = loss(batch), compiled(batch)
+        assert list(got.keys()) == OUT_KEYS
+        assert_close(got, expected)
+        assert_close(gradients(got["loss_actor"], loss), gradients(expected["loss_actor"], loss))
+        move(loss.actor_network)
+        for name in case.temperatures:
+            setattr(loss, name, 0.25 / (1 + step))
+        torch._dynamo.config.error_on_recompile = True
+
+
+@losses
+@compiler_warnings
+def test_compile(case):
+    """All that the compiler does before it generates code."""
+    with torch._dynamo.config.patch(error_on_recompile=False):
+        _assert_compiled_is_eager(case, "aot_eager")
+
+
+@pytest.mark.slow
+@losses
+@pytest.mark.parametrize("backend", ["eager", "inductor"])
+@compiler_warnings
+def test_compile_with_other_backends(case, backend):
+    """Inductor is the one that generates code."""
+    with torch._dynamo.config.patch(error_on_recompile=False):
+        _assert_compiled_is_eager(case, backend)

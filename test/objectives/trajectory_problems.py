@@ -1,0 +1,359 @@
+"""Small actors, sampled batches and the losses written out in plain numbers, for the tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase, is_tensor_collection
+from tensordict.nn import (
+    CompositeDistribution,
+    InteractionType,
+    NormalParamExtractor,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    set_interaction_type,
+)
+from torch import Tensor, nn
+from torch.distributions import Categorical
+from torchrl.modules import (
+    GRUModule,
+    IndependentNormal,
+    LSTMModule,
+    OneHotCategorical,
+    ProbabilisticActor,
+    TanhNormal,
+    set_recurrent_mode,
+)
+
+from torchrl_ecpo.objectives import (
+    ECPOLoss,
+    MENTLoss,
+    PMDLoss,
+    TrajectoryGroupLoss,
+    UREXLoss,
+)
+
+OBSERVATION, ACTIONS, HIDDEN = 3, 4, 5
+MASK = ("collector", "mask")
+
+# ------------------------------------------------------------------------------------- the actors
+
+
+def _probabilistic(
+    distribution: type, parameters: list[str], *modules: nn.Module
+) -> ProbabilisticActor:
+    network = TensorDictModule(nn.Sequential(*modules), ["observation"], parameters)
+    return ProbabilisticActor(
+        network, in_keys=parameters, distribution_class=distribution, return_log_prob=True
+    )
+
+
+def _composite() -> ProbabilisticTensorDictSequential:
+    heads = [("params", "move", "logits"), ("params", "force", "loc"), ("params", "force", "scale")]
+    return ProbabilisticTensorDictSequential(
+        TensorDictModule(nn.Linear(OBSERVATION, 3), ["observation"], heads[:1]),
+        TensorDictModule(
+            nn.Sequential(nn.Linear(OBSERVATION, 4), NormalParamExtractor()),
+            ["observation"],
+            heads[1:],
+        ),
+        ProbabilisticTensorDictModule(
+            in_keys=["params"],
+            out_keys=[("action", "move"), "force"],
+            distribution_class=CompositeDistribution,
+            distribution_kwargs={
+                "distribution_map": {"move": Categorical, "force": IndependentNormal},
+                "name_map": {"move": ("action", "move"), "force": "force"},
+            },
+            return_log_prob=True,
+        ),
+    )
+
+
+def _recurrent(
+    module: type[LSTMModule] | type[GRUModule],
+) -> ProbabilisticTensorDictSequential:
+    return ProbabilisticTensorDictSequential(
+        module(input_size=OBSERVATION, hidden_size=HIDDEN, in_key="observation", out_key="memory"),
+        TensorDictModule(nn.Linear(HIDDEN, ACTIONS), ["memory"], ["logits"]),
+        ProbabilisticTensorDictModule(
+            in_keys=["logits"],
+            out_keys=["action"],
+            distribution_class=Categorical,
+            return_log_prob=True,
+        ),
+    )
+
+
+ACTORS: dict[str, Callable[[], ProbabilisticTensorDictSequential]] = {
+    "categorical": lambda: _probabilistic(Categorical, ["logits"], nn.Linear(OBSERVATION, ACTIONS)),
+    "one_hot": lambda: _probabilistic(
+        OneHotCategorical, ["logits"], nn.Linear(OBSERVATION, ACTIONS)
+    ),
+    "normal": lambda: _probabilistic(
+        IndependentNormal, ["loc", "scale"], nn.Linear(OBSERVATION, 4), NormalParamExtractor()
+    ),
+    "tanh_normal": lambda: _probabilistic(
+        TanhNormal, ["loc", "scale"], nn.Linear(OBSERVATION, 4), NormalParamExtractor()
+    ),
+    "composite": _composite,
+    "lstm": lambda: _recurrent(LSTMModule),
+    "gru": lambda: _recurrent(GRUModule),
+}
+
+ACTOR_KEYS: dict[str, dict[str, Any]] = {
+    "composite": {
+        "action": [("action", "move"), "force"],
+        "sample_log_prob": [("action", "move_log_prob"), "force_log_prob"],
+    }
+}
+
+
+def make_actor(
+    kind: str = "categorical", *, dtype: torch.dtype = torch.float64
+) -> ProbabilisticTensorDictSequential:
+    """An actor with the same parameters every time."""
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        return ACTORS[kind]().to(dtype)
+
+
+def move(actor: nn.Module, size: float = 0.2) -> None:
+    """Change the parameters, as some optimiser steps would."""
+    generator = torch.Generator().manual_seed(2)
+    for parameter in actor.parameters():
+        noise = torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype)
+        parameter.data.add_(size * noise.to(parameter.device))
+
+
+# ------------------------------------------------------------------------------------ the batches
+
+
+def _steps(actor: nn.Module, trajectories: TensorDictBase) -> Iterator[tuple[int, TensorDictBase]]:
+    """One step of ``[N, T]`` after another, each with the memory that the last one left."""
+    memory = TensorDict({}, trajectories.batch_size[:1])
+    for t in range(trajectories.shape[1]):
+        step = trajectories[:, t].select("observation", "is_init").update(memory)
+        with set_recurrent_mode(False):
+            yield t, step
+        states = [key for key in getattr(actor, "out_keys", []) if "recurrent_state" in str(key)]
+        memory = step.select(*states).get("next", memory)
+
+
+def sample(actor: ProbabilisticTensorDictSequential, *shape: int, seed: int = 0) -> TensorDict:
+    """A batch ``[*G, K, T]`` of the actor's rollouts, every entry as a collector writes it."""
+    parameter = next(actor.parameters())
+    num_steps = shape[-1]
+    num_trajectories = torch.Size(shape[:-1]).numel()
+    with torch.random.fork_rng(), torch.no_grad(), set_interaction_type(InteractionType.RANDOM):
+        torch.manual_seed(seed)
+        size = (num_trajectories, num_steps)
+        is_init = torch.zeros(*size, 1, dtype=torch.bool)
+        is_init[:, 0] = True
+        done = torch.zeros(*size, 1, dtype=torch.bool)
+        done[:, -1] = True
+        batch = TensorDict(
+            {
+                "observation": torch.randn(*size, OBSERVATION, dtype=parameter.dtype),
+                "is_init": is_init,
+                "next": {
+                    "reward": torch.randn(*size, 1, dtype=parameter.dtype),
+                    "done": done,
+                },
+            },
+            batch_size=size,
+        )
+        steps = []
+        for _, step in _steps(actor, batch):
+            steps.append(actor(step).exclude("logits", "loc", "scale", "params", "memory"))
+            for key in ("recurrent_state", "recurrent_state_h", "recurrent_state_c"):
+                if ("next", key) in step.keys(True):
+                    zeros = torch.zeros_like(step["next", key])
+                    steps[-1] = steps[-1].clone(False).set(key, step.get(key, zeros))
+        return batch.update(torch.stack([s.exclude("next") for s in steps], 1)).reshape(*shape)
+
+
+LENGTHS = (4, 1, 3, 2, 4, 3)
+
+
+def pad(batch: TensorDictBase, *, masked: tuple[int, ...] = ()) -> TensorDict:
+    """The batch with trajectories cut to unequal lengths, junk in all padded steps, and the mask.
+
+    ``masked`` numbers trajectories (of the flattened batch) that lose every step.
+    """
+    num_trajectories = batch.shape[:-1].numel()
+    lengths = torch.tensor([LENGTHS[n % len(LENGTHS)] for n in range(num_trajectories)])
+    lengths[list(masked)] = 0
+    mask = (torch.arange(batch.shape[-1]) < lengths.unsqueeze(-1)).reshape(batch.shape)
+
+    def spoil(values: Tensor) -> Tensor:
+        spoilt = values.clone()
+        if values.is_floating_point():
+            spoilt[~mask] = torch.nan
+            spoilt[~mask & (torch.arange(batch.shape[-1]) % 2 == 0)] = -torch.inf
+        else:
+            spoilt[~mask] = True if values.dtype == torch.bool else -(10**6)
+        return spoilt
+
+    return TensorDict.apply(batch, spoil).set(MASK, mask)  # type: ignore[union-attr]
+
+
+def split(batch: TensorDictBase) -> list[list[TensorDictBase]]:
+    """Groups of trajectories ``[1, T_k]`` without padding; those without a step are left out."""
+    groups = []
+    for group in batch.reshape(-1, *batch.shape[-2:]).unbind(0):
+        trajectories = []
+        for trajectory in group.unbind(0):
+            mask = trajectory.get(MASK, torch.ones(trajectory.shape, dtype=torch.bool))
+            if mask.any():
+                trajectories.append(trajectory[mask].unsqueeze(0))
+        groups.append(trajectories)
+    return groups
+
+
+# --------------------------------------------------------------------------- the losses, in words
+
+
+@dataclass
+class Numbers:
+    """One group: a number for each trajectory, ``[K]``."""
+
+    returns: Tensor
+    log_prob: Tensor
+    reference: Tensor
+    behaviour: Tensor
+    num_steps: Tensor
+
+
+def trajectory_log_prob(actor: ProbabilisticTensorDictSequential, trajectory: TensorDictBase):
+    """The sum over steps, one step after another, of log pi(a_t | s_t)."""
+    total = torch.zeros((), dtype=next(actor.parameters()).dtype)
+    for t, step in _steps(actor, trajectory):
+        dist = actor.get_dist(step)
+        if isinstance(dist, CompositeDistribution):
+            parts = dist.log_prob(trajectory[:, t])
+            assert is_tensor_collection(parts)
+            total = total + parts[("action", "move_log_prob")] + parts["force_log_prob"]
+        else:
+            total = total + dist.log_prob(trajectory[:, t]["action"])
+    return total.squeeze(0)
+
+
+def recorded_log_prob(trajectory: TensorDictBase) -> Tensor:
+    """The sum of what the sampler wrote."""
+    log_prob = trajectory.get("action_log_prob", None)
+    if log_prob is not None:
+        return log_prob.sum()
+    return (trajectory["action", "move_log_prob"] + trajectory["force_log_prob"]).sum()
+
+
+def numbers(
+    actor: ProbabilisticTensorDictSequential,
+    group: list[TensorDictBase],
+    reference: ProbabilisticTensorDictSequential | None = None,
+) -> Numbers:
+    """What the formulas need; the recorded log-probability is the reference's by default."""
+    recorded = torch.stack([recorded_log_prob(t) for t in group])
+    with torch.no_grad():
+        references = (
+            recorded
+            if reference is None
+            else torch.stack([trajectory_log_prob(reference, t) for t in group])
+        )
+    return Numbers(
+        returns=torch.stack([t["next", "reward"].sum() for t in group]),
+        log_prob=torch.stack([trajectory_log_prob(actor, t) for t in group]),
+        reference=references,
+        behaviour=recorded,
+        num_steps=recorded.new_tensor([t.shape[1] for t in group]),
+    )
+
+
+def normalise(weights: Tensor) -> Tensor:
+    """Weights that sum to one."""
+    return weights / weights.sum()
+
+
+def ecpo(n: Numbers, *, tau: float, tau_prime: float) -> tuple[Tensor, Tensor]:
+    """Eq. 6: -sum_k w_k log pi, w ~ pi_bar/beta exp((r - tau' log pi_bar) / (tau + tau'))."""
+    lift = ((n.returns - tau_prime * n.reference) / (tau + tau_prime)).exp()
+    weights = normalise(lift * (n.reference - n.behaviour).exp())
+    return -(weights * n.log_prob).sum(), weights
+
+
+def pmd(n: Numbers, *, tau: float, tau_prime: float) -> tuple[Tensor, Tensor]:
+    """Footnote 1: the score function of r - tau log(pi/pi_bar) - tau' log pi, ratios pi/beta."""
+    log_prob = n.log_prob.detach()
+    ratios = normalise((log_prob - n.behaviour).exp())
+    advantage = n.returns - tau * (log_prob - n.reference) - tau_prime * log_prob
+    centred = advantage - (ratios * advantage).sum()
+    return -(ratios * centred * n.log_prob).sum(), ratios
+
+
+def urex(n: Numbers, *, tau: float) -> tuple[Tensor, Tensor]:
+    """-mean_k (S - mean S) log pi with S = r + tau K softmax(r / tau - log pi)."""
+    log_prob = n.log_prob.detach()
+    weights = normalise((n.returns / tau - log_prob).exp())
+    signal = n.returns + tau * len(weights) * weights
+    return -((signal - signal.mean()) * n.log_prob).mean(), weights
+
+
+def ment(n: Numbers, *, tau: float) -> tuple[Tensor, Tensor]:
+    """-mean_k (S - mean S) log pi with S = r - tau log pi."""
+    signal = n.returns - tau * n.log_prob.detach()
+    uniform = torch.full_like(signal, 1 / len(signal))
+    return -((signal - signal.mean()) * n.log_prob).mean(), uniform
+
+
+def reinforce(n: Numbers) -> Tensor:
+    """The score function of the return, with the group's mean as baseline."""
+    return -((n.returns - n.returns.mean()) * n.log_prob).mean()
+
+
+@dataclass
+class Case:
+    """A loss, the temperatures it is tested with (not its defaults), and its formula."""
+
+    loss: type[TrajectoryGroupLoss]
+    temperatures: dict[str, float]
+    formula: Callable[..., tuple[Tensor, Tensor]]
+    options: dict[str, Any] = field(default_factory=dict)
+
+    def build(self, actor: nn.Module, **kwargs: Any) -> TrajectoryGroupLoss:
+        """The loss, in the dtype of the actor, with temperatures exact in that dtype."""
+        loss = self.loss(actor, **self.temperatures, **self.options, **kwargs)  # type: ignore
+        loss.to(next(actor.parameters()).dtype)
+        for name, value in self.temperatures.items():
+            setattr(loss, name, value)
+        return loss
+
+    def expected(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor]:
+        """Loss and weights of one group, by the formula."""
+        return self.formula(numbers(*args, **kwargs), **self.temperatures)
+
+
+CASES = {
+    "ecpo": Case(ECPOLoss, {"tau": 0.7, "tau_prime": 0.3}, ecpo),
+    "pmd": Case(PMDLoss, {"tau": 0.7, "tau_prime": 0.3}, pmd),
+    "urex": Case(UREXLoss, {"tau": 0.6}, urex),
+    "ment": Case(MENTLoss, {"tau": 0.4}, ment),
+}
+LIFTING = ("ecpo", "pmd")
+
+
+def gradients(value: Tensor, actor: nn.Module) -> list[Tensor]:
+    """With respect to every parameter."""
+    return list(torch.autograd.grad(value, list(actor.parameters())))
+
+
+def as_keywords(loss: TrajectoryGroupLoss, batch: TensorDictBase) -> dict[str, Tensor]:
+    """The keywords of a call without a tensordict."""
+    return {
+        "_".join((key,) if isinstance(key, str) else key): batch[key]
+        for key in loss.in_keys
+        if key in batch.keys(True, True)
+    }

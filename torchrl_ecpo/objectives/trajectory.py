@@ -1,0 +1,533 @@
+"""What every loss over groups of trajectories shares: reading, checking, reducing, reporting."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams, is_tensor_collection
+from tensordict.nn import (
+    CompositeDistribution,
+    ProbabilisticTensorDictSequential,
+    composite_lp_aggregate,
+    dispatch,
+)
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from torchrl_ecpo.functional import (
+    Surrogate,
+    check_temperatures,
+    effective_sample_size,
+    lifted_log_weights,
+    self_normalised_weights,
+)
+
+__all__ = ["LiftProjectLoss", "TrajectoryGroupLoss", "TrajectoryGroups"]
+
+REDUCTIONS = ("none", "mean", "sum")
+OUT_KEYS = (
+    "loss_actor",
+    "ESS",
+    "max_weight",
+    "kl_to_reference",
+    "entropy",
+    "return",
+    "equal_return_groups",
+)
+
+
+class TrajectoryGroups(NamedTuple):
+    """Groups of K trajectories as numbers, one for each trajectory: every field is ``[*G, K]``."""
+
+    returns: Tensor
+    """r(rho): the sum of the rewards."""
+    log_prob: Tensor
+    """log pi_theta(rho), under the policy being trained; carries the gradient."""
+    reference_log_prob: Tensor
+    """log pi_bar(rho), under the reference policy."""
+    behaviour_log_prob: Tensor
+    """log beta(rho), under the policy that drew the trajectories."""
+    num_steps: Tensor
+    """Number of real steps, in the dtype of the returns."""
+    mask: Tensor | None
+    """True where the trajectory has a real step; None where all have."""
+
+
+class TrajectoryGroupLoss(LossModule):
+    """Base class of the losses over groups of K trajectories of one problem instance.
+
+    It reads a batch ``[*G, K, T]`` (any number of group dimensions, also none), sums rewards and
+    log-probabilities over the real steps of each trajectory, hands the numbers to
+    :meth:`surrogate`, and reduces and reports what comes back. A new member of the family
+    implements that one method.
+
+    Real steps are those that :attr:`loss_mask_key` marks, by default TorchRL's own
+    ``("collector", "mask")`` where it is present. A trajectory without a real step is left out of
+    its group. Whatever stands in padded steps has no influence.
+
+    Args:
+        actor_network: a policy with ``get_dist``: feed-forward or recurrent (it is called in
+            recurrent mode on ``[N, T]``), with any action distribution whose log-probability has
+            the shape of the batch, also a composite one (the parts are added up).
+
+    Keyword Args:
+        temperatures: initial values by name; each becomes a buffer that is scheduled by assignment
+            (``loss.tau = 0.1``). In the unit of the return.
+        delay_actor: if True, the loss keeps ``target_actor_network_params`` as reference policy, to
+            be moved by an updater (:mod:`torchrl_ecpo.updaters`), and corrects for the policy that
+            drew the trajectories where its log-probability is recorded. If False (default, and
+            Algorithm 1's case), the recorded log-probability *is* the reference's.
+        reduction: ``"mean"`` over the groups (default), ``"sum"``, or ``"none"`` for one number
+            for each group.
+
+    Raises:
+        ValueError: for an unknown reduction or a temperature that is not allowed; when called, for
+            a wrong shape, a group of one, a mask without a real step, a reward or recorded
+            log-probability that is not finite.
+        TypeError: if ``actor_network`` has no ``get_dist``.
+        KeyError: when called, for a missing entry.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Entries of the input tensordict, all of leading shape ``[*G, K, T]``.
+
+        Attributes:
+            action: what was done; a list of keys for a composite action. Defaults to ``"action"``.
+            reward: ``[*G, K, T, 1]``, read from ``"next"``. Defaults to ``"reward"``.
+            sample_log_prob: log-probability of the action under the policy that drew it,
+                ``[*G, K, T]``; a list of keys is added up. Defaults to ``"action_log_prob"``, or
+                to ``"sample_log_prob"`` if ``composite_lp_aggregate()`` is True, as in TorchRL.
+        """
+
+        action: NestedKey | list[NestedKey] = "action"
+        reward: NestedKey = "reward"
+        sample_log_prob: NestedKey | list[NestedKey] | None = None
+
+        def __post_init__(self) -> None:
+            if self.sample_log_prob is None:
+                self.sample_log_prob = (
+                    "sample_log_prob" if composite_lp_aggregate(nowarn=True) else "action_log_prob"
+                )
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+
+    actor_network: ProbabilisticTensorDictSequential
+    actor_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
+
+    _may_be_zero: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        *,
+        temperatures: dict[str, float],
+        delay_actor: bool = False,
+        reduction: Literal["none", "mean", "sum"] | None = None,
+    ) -> None:
+        self._in_keys: list[NestedKey] | None = None
+        super().__init__()
+        self.out_keys = list(OUT_KEYS)
+        if not hasattr(actor_network, "get_dist"):
+            raise TypeError(
+                "actor_network must have a get_dist method, as ProbabilisticActor and "
+                f"ProbabilisticTensorDictSequential have; got {type(actor_network).__name__}."
+            )
+        reduction = "mean" if reduction is None else reduction
+        if reduction not in REDUCTIONS:
+            raise ValueError(f"reduction must be one of {REDUCTIONS} or None, got {reduction!r}.")
+        self.reduction = reduction
+        self.delay_actor = delay_actor
+        check_temperatures(allow_zero=self._may_be_zero, **temperatures)
+        for name, value in temperatures.items():
+            self.register_coeff_buffer(name, float(value))
+        self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Refuse a scheduled temperature that is not allowed, and keep the old one."""
+        schedulable = type(self)._all_schedulable_buffers
+        if name in schedulable and isinstance(value, (int, float)):
+            current = {other: getattr(self, other).item() for other in sorted(schedulable)}
+            check_temperatures(allow_zero=self._may_be_zero, **{**current, name: value})
+        super().__setattr__(name, value)  # pyright: ignore[reportArgumentType] - of TorchRL's base
+
+    # ------------------------------------------------------------------------------- one method
+
+    @abstractmethod
+    def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
+        """The loss of each group ``[*G]``, and the weights it gave the trajectories ``[*G, K]``."""
+
+    @dispatch  # pyright: ignore[reportArgumentType] - it is typed for its other use, with arguments
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute the loss of a batch of groups.
+
+        Args:
+            tensordict: ``[*G, K, T]`` with the entries of :attr:`in_keys`; nothing is written.
+
+        Returns:
+            ``loss_actor`` and, detached, the diagnostics of :attr:`out_keys`: means over groups,
+            or one number a group (``[*G]``) with ``reduction="none"``.
+        """
+        groups = self._read(tensordict)
+        loss, weights = self.surrogate(groups)
+        diagnostics = _diagnostics(groups, weights)
+        if self.reduction == "none":
+            batch_size = loss.shape
+        else:
+            batch_size = torch.Size([])
+            diagnostics = {name: value.mean() for name, value in diagnostics.items()}
+        outputs = {"loss_actor": self._reduce_loss(loss), **diagnostics}
+        td_out = TensorDict(outputs, batch_size=batch_size).select(*self.out_keys)
+        self._clear_weakrefs(
+            tensordict, td_out, "actor_network_params", "target_actor_network_params"
+        )
+        return td_out
+
+    # ------------------------------------------------------------------------------------- keys
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """What the loss reads; keywords of a call without a tensordict are these, joined by _."""
+        if self._in_keys is not None:
+            return self._in_keys
+        keys = [
+            *self.actor_network.in_keys,
+            *_as_list(self.tensor_keys.action),
+            self._reward_key,
+            *_as_list(self.tensor_keys.sample_log_prob),
+            *self._loss_mask_keys()[:1],
+        ]
+        return list(dict.fromkeys(keys))
+
+    @in_keys.setter
+    def in_keys(self, keys: Sequence[NestedKey]) -> None:
+        self._in_keys = list(keys)
+
+    def _set_in_keys(self) -> None:
+        """Called by ``set_keys``: keys that were given are the old ones."""
+        self._in_keys = None
+
+    def select_out_keys(self, *out_keys: str) -> TrajectoryGroupLoss:
+        """Return these entries only, until :meth:`reset_out_keys`.
+
+        Instead of TensorDict's own hook, which takes a call for one with keywords if an entry of
+        :attr:`in_keys` is absent: the mask and the states of a recurrent actor may be.
+
+        Raises:
+            ValueError: for a key that is not among the :attr:`out_keys`.
+        """
+        unknown = [key for key in out_keys if key not in OUT_KEYS]
+        if unknown or not out_keys:
+            raise ValueError(f"Select some of the out_keys {list(OUT_KEYS)}, got {list(out_keys)}.")
+        self.out_keys = list(out_keys)
+        return self
+
+    def reset_out_keys(self) -> TrajectoryGroupLoss:
+        """Undo :meth:`select_out_keys`."""
+        self.out_keys = list(OUT_KEYS)
+        return self
+
+    @property
+    def _reward_key(self) -> NestedKey:
+        reward = self.tensor_keys.reward
+        return ("next", *((reward,) if isinstance(reward, str) else reward))
+
+    # ---------------------------------------------------------------------------------- reading
+
+    def _read(self, tensordict: TensorDictBase) -> TrajectoryGroups:
+        """Sum rewards and log-probabilities over the real steps of each trajectory."""
+        reward = _get(tensordict, self._reward_key)
+        shape = _batch_shape(reward, self._reward_key)
+        step_mask = self._step_mask(tensordict, shape)
+
+        def over_steps(values: Tensor) -> Tensor:
+            return (values if step_mask is None else values.where(step_mask, 0.0)).sum(-1)
+
+        recorded = self._recorded_log_prob(tensordict, shape)
+        inputs = self._actor_inputs(tensordict, shape, step_mask)
+        log_prob = over_steps(self._log_prob(inputs, self.actor_network_params, shape))
+        if self.delay_actor:
+            with torch.no_grad():
+                params = self.target_actor_network_params
+                reference = over_steps(self._log_prob(inputs, params, shape))
+            behaviour = reference if recorded is None else over_steps(recorded)
+        else:
+            reference = behaviour = over_steps(self._demanded(recorded))
+        groups = TrajectoryGroups(
+            returns=over_steps(reward.squeeze(-1).to(log_prob.dtype)),
+            log_prob=log_prob,
+            reference_log_prob=reference,
+            behaviour_log_prob=behaviour,
+            num_steps=over_steps(torch.ones_like(reward.squeeze(-1), dtype=log_prob.dtype)),
+            mask=None if step_mask is None else step_mask.any(-1),
+        )
+        self._check_values(groups)
+        return groups
+
+    def _step_mask(self, tensordict: TensorDictBase, shape: torch.Size) -> Tensor | None:
+        """Conjunction of the masks that :attr:`loss_mask_key` names, those that are there."""
+        step_mask = None
+        for key in self._loss_mask_keys():
+            mask = tensordict.get(key, None)
+            if mask is None:
+                continue
+            if mask.shape == (*shape, 1):
+                mask = mask.squeeze(-1)
+            if mask.shape != shape:
+                raise ValueError(
+                    f"The mask {key!r} must have the shape [*G, K, T] = {tuple(shape)} of the "
+                    f"batch, got {tuple(mask.shape)}."
+                )
+            if mask.dtype != torch.bool:
+                raise ValueError(
+                    f"The mask {key!r} must be boolean (True: the step is real), got {mask.dtype}."
+                )
+            step_mask = mask if step_mask is None else step_mask & mask
+        return step_mask
+
+    def _actor_inputs(
+        self, tensordict: TensorDictBase, shape: torch.Size, step_mask: Tensor | None
+    ) -> TensorDictBase:
+        """What the actor read and did, as a new tensordict ``[N, T]`` without padding.
+
+        A padded step becomes a copy of the last real one before it: valid input to any network and
+        distribution, whatever stood there. (NaN would reach the gradient as 0 * NaN; a zero may be
+        outside the support of the actions.) The mask goes along, so that an actor may save work.
+        """
+        action_keys = _as_list(self.tensor_keys.action)
+        for key in action_keys:
+            _get(tensordict, key)
+        inputs = tensordict.select(*self.actor_network.in_keys, *action_keys, strict=False)
+        inputs = inputs.copy()  # entries that are tensordicts would get the batch size below
+        try:
+            inputs.batch_size = shape
+        except RuntimeError as error:
+            raise ValueError(
+                f"What the actor reads and did must have the leading shape [*G, K, T] = "
+                f"{tuple(shape)} of the reward: {error}"
+            ) from error
+        inputs = inputs.reshape(-1, shape[-1])
+        if step_mask is not None:
+            step_mask = step_mask.reshape(-1, shape[-1])
+            inputs = inputs[_last_real_step(step_mask)]
+            inputs.set(self._loss_mask_keys()[0], step_mask)
+        return inputs
+
+    def _log_prob(
+        self, inputs: TensorDictBase, params: TensorDictParams, shape: torch.Size
+    ) -> Tensor:
+        """Log-probability ``[*G, K, T]`` of the recorded actions under given parameters."""
+        inputs = inputs.copy()  # the actor writes its intermediate results into its input
+        with params.to_module(self.actor_network, preserve_module_state=False):
+            dist = self.actor_network.get_dist(inputs)
+        action_keys = _as_list(self.tensor_keys.action)
+        if isinstance(dist, CompositeDistribution):
+            log_prob = dist.log_prob(inputs.select(*action_keys))
+        elif len(action_keys) == 1:
+            log_prob = dist.log_prob(inputs.get(action_keys[0]))
+        else:
+            raise ValueError(
+                f"The action has several parts {action_keys}, but the actor's distribution is a "
+                f"{type(dist).__name__}, which has one. Name it with set_keys(action=...)."
+            )
+        if is_tensor_collection(log_prob):
+            log_prob = _sum_parts(log_prob)
+        if log_prob.shape != inputs.shape:
+            raise ValueError(
+                f"The actor's distribution {type(dist).__name__} gives log-probabilities of shape "
+                f"{tuple(log_prob.shape)} for a batch of shape {tuple(inputs.shape)}. They must "
+                "have one number for each step: sum over the parts of an action, for example with "
+                "torch.distributions.Independent or IndependentNormal."
+            )
+        return log_prob.reshape(shape)
+
+    def _recorded_log_prob(self, tensordict: TensorDictBase, shape: torch.Size) -> Tensor | None:
+        """Log-probability ``[*G, K, T]`` under the policy that drew the actions, if it is there."""
+        total = None
+        for key in _as_list(self.tensor_keys.sample_log_prob):
+            value = tensordict.get(key, None)
+            if value is None:
+                return None
+            if is_tensor_collection(value):
+                value = _sum_parts(value)
+            if value.shape != shape:
+                raise ValueError(
+                    f"The log-probability {key!r} must have the shape [*G, K, T] = {tuple(shape)}, "
+                    f"that of the reward without its trailing 1, got {tuple(value.shape)}: one "
+                    "number for each step, without a trailing dimension. Squeeze it, or sum it "
+                    "over the parts of the action."
+                )
+            total = value if total is None else total + value
+        return None if total is None else total.detach()
+
+    def _demanded(self, recorded: Tensor | None) -> Tensor:
+        if recorded is None:
+            raise KeyError(
+                f"The entry {self.tensor_keys.sample_log_prob!r} is missing: the log-probability "
+                "of each action under the policy that drew it. Build the actor with "
+                "return_log_prob=True, or name the entry with set_keys(sample_log_prob=...); the "
+                "lift-and-project losses can also be built with delay_actor=True and evaluate a "
+                "reference policy of their own."
+            )
+        return recorded
+
+    def _check_values(self, groups: TrajectoryGroups) -> None:
+        """Refuse values that would silently spoil a whole group. One look; none when compiled."""
+        if torch.compiler.is_compiling():
+            return
+        quantities = {
+            f"entry {self._reward_key!r}": groups.returns,
+            f"entry {self.tensor_keys.sample_log_prob!r}": groups.behaviour_log_prob,
+            "log-probability under the reference policy": groups.reference_log_prob,
+            "log-probability under the actor": groups.log_prob,
+        }
+        if groups.behaviour_log_prob is groups.reference_log_prob and self.delay_actor:
+            del quantities[f"entry {self.tensor_keys.sample_log_prob!r}"]  # it is not there
+        finite = torch.stack(list(quantities.values())).isfinite()
+        has_steps = finite.new_ones(()) if groups.mask is None else groups.mask.any(-1)
+        if bool((finite.all() & has_steps.all()).item()):
+            return
+        if not bool(has_steps.all().item()):
+            raise ValueError(
+                f"The mask ({self._loss_mask_keys()}) leaves {int((~has_steps).sum())} group(s) "
+                "without a single real step. Drop such groups before calling the loss."
+            )
+        name, values = next(item for item in quantities.items() if not item[1].isfinite().all())
+        raise ValueError(
+            f"The {name} is NaN or infinite in {int((~values.isfinite()).sum())} of "
+            f"{values.numel()} trajectories. Mend the environment or the policy that it comes from."
+        )
+
+
+class LiftProjectLoss(TrajectoryGroupLoss):
+    """A :class:`TrajectoryGroupLoss` that lifts a reference policy by Eq. 5 and projects onto it.
+
+    Args:
+        actor_network: see :class:`TrajectoryGroupLoss`.
+
+    Keyword Args:
+        tau: temperature of the divergence from the reference policy, in the unit of the return.
+        tau_prime: temperature of the entropy, in the unit of the return.
+        length_normalised: if True, the entropy term of the lift is per step: log pi_bar(rho) is
+            divided by the number of steps, so that long trajectories are not favoured for being
+            improbable. Not in the paper; off by default.
+        delay_actor: see :class:`TrajectoryGroupLoss`.
+        reduction: see :class:`TrajectoryGroupLoss`.
+    """
+
+    _schedulable_buffers = frozenset({"tau", "tau_prime"})
+
+    tau: Tensor
+    tau_prime: Tensor
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        *,
+        tau: float,
+        tau_prime: float,
+        length_normalised: bool = False,
+        delay_actor: bool = False,
+        reduction: Literal["none", "mean", "sum"] | None = None,
+    ) -> None:
+        super().__init__(
+            actor_network,
+            temperatures={"tau": tau, "tau_prime": tau_prime},
+            delay_actor=delay_actor,
+            reduction=reduction,
+        )
+        self.length_normalised = length_normalised
+
+    def lift(self, groups: TrajectoryGroups) -> Tensor:
+        """Log-weight ``[*G, K]`` of the lifted policy relative to the reference: Eq. 5."""
+        reference = groups.reference_log_prob
+        if self.length_normalised:
+            reference = reference / groups.num_steps.clamp_min(1)
+        return lifted_log_weights(groups.returns, reference, tau=self.tau, tau_prime=self.tau_prime)
+
+
+# ------------------------------------------------------------------------------------- small parts
+
+
+def _as_list(keys: NestedKey | list[NestedKey] | None) -> list[NestedKey]:
+    return list(keys) if isinstance(keys, list) else [keys]  # type: ignore[list-item]
+
+
+def _get(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    value = tensordict.get(key, None)
+    if value is None:
+        present = ", ".join(sorted(map(repr, tensordict.keys(True, True))))
+        raise KeyError(
+            f"The entry {key!r} is missing; there are {present}. If it has another name, say so "
+            "with set_keys(...)."
+        )
+    return value
+
+
+def _sum_parts(log_prob: TensorDictBase) -> Tensor:
+    """Log-probability of a composite action from those of its independent parts."""
+    return torch.stack(list(log_prob.values(True, True))).sum(0)
+
+
+def _batch_shape(reward: Tensor, key: NestedKey) -> torch.Size:
+    """[*G, K, T] of a batch, from its rewards."""
+    if reward.ndim < 3 or reward.shape[-1] != 1:
+        raise ValueError(
+            f"The reward {key!r} must have the shape [*G, K, T, 1] (groups, K trajectories of one "
+            f"problem instance, T steps), got {tuple(reward.shape)}."
+        )
+    if reward.shape[-3] < 2:
+        raise ValueError(
+            f"A group must have K >= 2 trajectories, got a batch [*G, K, T] = "
+            f"{tuple(reward.shape[:-1])} with K = {reward.shape[-3]}: weights are relative to the "
+            "other trajectories of the group."
+        )
+    return reward.shape[:-1]
+
+
+def _last_real_step(step_mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Index ``[N, T]`` of the last real step at or before each step, the first real one if none.
+
+    Trajectories without a real step borrow those of the first trajectory that has one.
+    """
+    steps = torch.arange(step_mask.shape[-1], device=step_mask.device)
+    latest = steps.where(step_mask, -1).cummax(-1).values
+    first = step_mask.int().argmax(-1, keepdim=True)
+    columns = latest.where(latest >= 0, first)
+    has_steps = step_mask.any(-1)
+    rows = torch.arange(step_mask.shape[0], device=step_mask.device)
+    rows = rows.where(has_steps, has_steps.int().argmax())
+    return rows.unsqueeze(-1).expand_as(columns), columns[rows]
+
+
+def _diagnostics(groups: TrajectoryGroups, weights: Tensor) -> dict[str, Tensor]:
+    """What to watch, ``[*G]`` each, without gradient.
+
+    KL(reference, policy) and the entropy of the policy are estimates from K trajectories, so the
+    former may come out below 0.
+    """
+    mask = groups.mask
+    log_prob = groups.log_prob.detach()
+    log_ratio = groups.reference_log_prob - groups.behaviour_log_prob
+    of_reference = self_normalised_weights(log_ratio, mask=mask)
+    of_policy = self_normalised_weights(log_prob - groups.behaviour_log_prob, mask=mask)
+    uniform = self_normalised_weights(torch.zeros_like(log_prob), mask=mask)
+    returns = groups.returns
+    real = torch.ones_like(returns, dtype=torch.bool) if mask is None else mask
+    highest = returns.where(real, -torch.inf).amax(-1)
+    lowest = returns.where(real, torch.inf).amin(-1)
+    return {
+        "ESS": effective_sample_size(weights),
+        "max_weight": weights.amax(-1),
+        "kl_to_reference": (of_reference * (groups.reference_log_prob - log_prob)).sum(-1),
+        "entropy": -(of_policy * log_prob).sum(-1),
+        "return": (uniform * returns).sum(-1),
+        "equal_return_groups": (highest == lowest).to(returns.dtype),
+    }
