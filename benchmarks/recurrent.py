@@ -1,0 +1,130 @@
+"""The recurrent tuple policy: each distinct history once, against TorchRL's LSTMModule.
+
+    python benchmarks/recurrent.py --steps 10 35 66
+
+One thread; both policies have the same weights and inputs and take turns. "sample" is a rollout's
+worth of policy steps, "update" one forward and backward pass over its log-probabilities; figures
+are medians of processor time in milliseconds, which other processes disturb least. The inputs are
+synthetic: the rollouts of a group follow one path, which each leaves with probability `--branch` at
+every step; "share" is the part of all histories that is distinct.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDict
+from torchrl.modules import ProbabilisticActor, set_recurrent_mode
+
+from torchrl_ecpo.modules import make_tuple_policy
+
+NVEC = (2, 2, 5)
+NUM_OBSERVATIONS = 6
+STATES = ("recurrent_state_h", "recurrent_state_c")
+
+
+def make_histories(groups: int, rollouts: int, steps: int, branch: float) -> TensorDict:
+    """Inputs and actions `[groups * rollouts, steps]` of rollouts that leave their group's path."""
+    shape = (groups, rollouts, steps)
+    observation = torch.randint(NUM_OBSERVATIONS, shape)
+    action = torch.stack([torch.randint(n, shape) for n in NVEC], -1)
+    # Groups differ by their tapes, yet all policies begin alike.
+    action[:, 0, :] = action[:1, 0, :]
+    on_path = (torch.rand(shape) >= branch).cummin(-1).values
+    observation = torch.where(on_path, observation[:, :1], observation)
+    action = torch.where(on_path.unsqueeze(-1), action[:, :1], action)
+    first = torch.tensor(NVEC).expand(groups, rollouts, 1, 3)
+    return TensorDict(
+        observation=observation,
+        previous_action=torch.cat([first, action[..., :-1, :]], 2),
+        action=action,
+        is_init=(torch.arange(steps) == 0).expand(shape).unsqueeze(-1),
+        batch_size=shape,
+    ).reshape(-1, steps)
+
+
+def sample(policy: ProbabilisticActor, data: TensorDict) -> None:
+    """Step through the data as a collector does."""
+    states = TensorDict(batch_size=data.shape[:1])
+    with torch.no_grad():
+        for inputs in data.unbind(1):
+            states = policy(inputs.copy().update(states))["next"].select(*STATES)
+
+
+def update(policy: ProbabilisticActor, data: TensorDict) -> None:
+    """One forward and backward pass."""
+    with set_recurrent_mode(True):
+        dist = policy.get_dist(data.copy())
+    dist.log_prob(data["action"]).sum().backward()
+
+
+def count_distinct(data: TensorDict) -> int:
+    """The number of distinct histories."""
+    inputs = torch.cat([data["observation"].unsqueeze(-1), data["previous_action"]], -1)
+    steps = range(1, data.shape[1] + 1)
+    return sum(len(inputs[:, :t].flatten(1).unique(dim=0)) for t in steps)
+
+
+def medians(
+    run: Callable[[ProbabilisticActor, TensorDict], None],
+    policies: list[ProbabilisticActor],
+    data: TensorDict,
+    repeats: int,
+) -> list[float]:
+    """Median times of policies that take turns, in milliseconds."""
+    times: list[list[float]] = [[] for _ in policies]
+    for repeat in range(repeats + 1):
+        for policy, seen in zip(policies, times, strict=True):
+            start = time.process_time()
+            run(policy, data)
+            if repeat:
+                seen.append(1e3 * (time.process_time() - start))
+    return [statistics.median(seen) for seen in times]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--steps", type=int, nargs="+", default=[10, 35, 66])
+    parser.add_argument("--branch", type=float, nargs="+", default=[0.01, 0.05, 0.2])
+    parser.add_argument("--groups", type=int, default=40)
+    parser.add_argument("--rollouts", type=int, default=10)
+    parser.add_argument("--hidden-size", type=int, default=128)
+    parser.add_argument("--repeats", type=int, default=5)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    policies = [
+        make_tuple_policy(
+            NUM_OBSERVATIONS,
+            NVEC,
+            hidden_size=arguments.hidden_size,
+            distinct_histories=distinct,
+        )
+        for distinct in (False, True)
+    ]
+    for plain, distinct in zip(*(policy.parameters() for policy in policies), strict=True):
+        distinct.data.copy_(plain)
+
+    rows = arguments.groups * arguments.rollouts
+    print(f"{rows} rows, hidden size {arguments.hidden_size}; plain / distinct, ms")
+    print("steps  branch  share |       sample        ratio |       update        ratio | both")
+    for steps in arguments.steps:
+        for branch in arguments.branch:
+            data = make_histories(arguments.groups, arguments.rollouts, steps, branch)
+            share = count_distinct(data) / data.numel()
+            sampling, updating = (
+                medians(run, policies, data, arguments.repeats) for run in (sample, update)
+            )
+            cells = [f"{steps:5d}  {branch:6.2f}  {share:5.2f}"]
+            for plain, distinct in (sampling, updating):
+                cells.append(f"{plain:8.1f} / {distinct:6.1f}  {plain / distinct:5.1f}x")
+            both = (sampling[0] + updating[0]) / (sampling[1] + updating[1])
+            print(" | ".join([*cells, f"{both:.1f}x"]), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,597 @@
+from __future__ import annotations
+
+import pickle
+from copy import deepcopy
+from itertools import product
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.testing import assert_close
+from torchrl.collectors import Collector
+from torchrl.data import Categorical, Composite, MultiCategorical, Unbounded
+from torchrl.envs import (
+    EnvBase,
+    ExplorationType,
+    TransformedEnv,
+    check_env_specs,
+    set_exploration_type,
+)
+from torchrl.modules import get_env_transforms_from_module, set_recurrent_mode
+
+from torchrl_ecpo._histories import distinct_histories, hash_states, mix
+from torchrl_ecpo.modules import DistinctHistoryLSTM, TupleCategorical, make_tuple_policy
+
+HEADS = ["masked", "unmasked", "joint"]
+DTYPES = [torch.float32, torch.float64]
+NVEC = (3, 2, 4)
+NUM_OBSERVATIONS = 5
+
+
+def all_actions(head: str) -> torch.Tensor:
+    """Every action that the head tells apart, `[n, 3]`."""
+    actions = torch.tensor(list(product(*(range(n) for n in NVEC))))
+    return actions if head == "unmasked" else actions[(actions[:, 1] == 1) | (actions[:, 2] == 0)]
+
+
+def random_dist(head: str, *batch: int, dtype: torch.dtype = torch.float64) -> TupleCategorical:
+    generator = torch.Generator().manual_seed(0)
+    size = TupleCategorical.num_logits(NVEC, head)
+    logits = torch.randn(*batch, size, dtype=dtype, generator=generator)
+    return TupleCategorical(2 * logits, NVEC, head)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("head", HEADS)
+class TestTupleCategorical:
+    def test_enumeration(self, head: str, dtype: torch.dtype) -> None:
+        dist = random_dist(head, 7, 1, dtype=dtype)
+        actions = all_actions(head)
+        log_probs = dist.log_prob(actions)
+        assert log_probs.shape == (7, len(actions))
+        assert log_probs.dtype == dtype
+        assert_close(log_probs.exp().sum(-1), torch.ones(7, dtype=dtype))
+        assert_close(dist.entropy().squeeze(-1), -(log_probs.exp() * log_probs).sum(-1))
+        assert_close(dist.mode.squeeze(1), actions[log_probs.argmax(-1)])
+        assert_close(dist.deterministic_sample, dist.mode)
+
+    def test_sample(self, head: str, dtype: torch.dtype) -> None:
+        torch.manual_seed(0)
+        dist = random_dist(head, 2, dtype=dtype)
+        assert dist.sample().shape == (2, 3)
+        sample = dist.sample((50_000,))
+        assert sample.shape == (50_000, 2, 3)
+        assert sample.dtype == torch.int64
+        assert dist.log_prob(sample).shape == (50_000, 2)
+        actions = all_actions(head)
+        counts = (sample.unsqueeze(-2) == actions).all(-1).sum(0)
+        assert (counts.sum(-1) == 50_000).all()
+        expected = 50_000 * dist.log_prob(actions.unsqueeze(1)).exp().T
+        # Five standard deviations of a binomial.
+        assert ((counts - expected).abs() <= 5 * expected.sqrt() + 1).all()
+
+    def test_extreme_logits(self, head: str, dtype: torch.dtype) -> None:
+        size = TupleCategorical.num_logits(NVEC, head)
+        largest = torch.finfo(dtype).max
+        logits = torch.tensor([0.0, 1e4, largest, -largest], dtype=dtype)
+        logits = logits.repeat(size)[torch.randperm(4 * size)].view(4, size).requires_grad_()
+        dist = TupleCategorical(logits, NVEC, head)
+        actions = all_actions(head).unsqueeze(1)
+        values = [dist.entropy(), dist.log_prob(actions).exp().sum(0), dist.log_prob(dist.mode)]
+        for value in values:
+            assert value.isfinite().all()
+        gradient = torch.autograd.grad(sum(v.sum() for v in values), logits)[0]
+        assert gradient.isfinite().all()
+        assert not dist.log_prob(actions).isnan().any()
+        assert ((dist.sample((100,)) >= 0) & (dist.sample((100,)) < torch.tensor(NVEC))).all()
+
+    def test_gradients_survive_an_earlier_no_grad_call(self, head: str, dtype: torch.dtype) -> None:
+        logits = random_dist(head, 3, dtype=dtype).logits.requires_grad_()
+        dist = TupleCategorical(logits, NVEC, head)
+        with torch.no_grad():
+            action = dist.sample()
+            dist.entropy()
+        assert torch.autograd.grad(dist.log_prob(action).sum(), logits)[0].abs().sum() > 0
+
+
+def test_masked_log_prob_is_the_formula() -> None:
+    logits = torch.randn(6, sum(NVEC), generator=torch.Generator().manual_seed(1))
+    move, write, character = (part.log_softmax(-1) for part in logits.split(NVEC, -1))
+    dist = TupleCategorical(logits, NVEC)
+    for action in all_actions("unmasked"):
+        m, w, c = action
+        expected = move[:, m] + write[:, w] + (character[:, c] if w else 0)
+        assert_close(dist.log_prob(action), expected)
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_distribution_gradients(head: str) -> None:
+    logits = random_dist(head, 4).logits.requires_grad_()
+    action = all_actions(head).unsqueeze(1)
+
+    def both(logits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        dist = TupleCategorical(logits, NVEC, head)
+        return dist.log_prob(action), dist.entropy()
+
+    assert torch.autograd.gradcheck(both, logits)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"head": "softmax"}, "head: expected 'masked', 'unmasked' or 'joint', got 'softmax'"),
+        ({"nvec": (3, 3, 4)}, r"nvec: expected \(moves, 2, characters\).* got \(3, 3, 4\)"),
+        ({"nvec": (3, 2)}, r"nvec: .* got \(3, 2\)"),
+        ({"logits": torch.zeros(2, 8)}, r"last dimension of 9 .* got shape \(2, 8\)"),
+        ({"logits": torch.full((2, 9), torch.nan)}, "parameter logits .*invalid values"),
+    ],
+)
+def test_distribution_refuses(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        TupleCategorical(**{"logits": torch.zeros(2, 9), "nvec": NVEC, **arguments})
+
+
+@pytest.mark.parametrize("head", HEADS)
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ([3, 0, 0], r"in \[0, nvec\) for nvec=\(3, 2, 4\), got values from \[3, 0, 0\]"),
+        ([0, -1, 0], r"got values from \[0, -1, 0\] to \[0, -1, 0\]"),
+        ([0, 1], r"last dimension of 3 \(move, write, character\), got shape \(2,\)"),
+    ],
+)
+def test_log_prob_refuses(head: str, action: list[int], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        random_dist(head).log_prob(torch.tensor(action))
+
+
+def test_mix_is_injective_on_what_it_hashes() -> None:
+    values = torch.cat([torch.arange(-1000, 50_000), torch.tensor([2**62, -(2**63), 2**63 - 1])])
+    assert mix(values).unique().numel() == values.numel()
+
+
+@pytest.mark.parametrize("hidden", [8, 7])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_state_hashes(dtype: torch.dtype, hidden: int) -> None:
+    h = torch.randn(200, hidden, dtype=dtype)
+    c = torch.randn(200, hidden, dtype=dtype)
+    hashes = hash_states(h, c)
+    assert hashes.unique().numel() == 200
+    assert_close(hash_states(h.flip(0), c.flip(0)), hashes.flip(0))
+    # One bit, signs, and which state is which all count.
+    assert (hash_states(h.nextafter(h + 1), c) != hashes).all()
+    assert (hash_states(-h, c) != hashes).all()
+    assert (hash_states(c, h) != hashes).all()
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_distinct_histories_against_a_dictionary(seed: int) -> None:
+    torch.manual_seed(seed)
+    steps, rows = 9, 30
+    symbols = torch.randint(2, (steps, rows))
+    starts = torch.rand(steps, rows) < 0.15
+    lengths = torch.randint(1, steps + 1, (rows,))
+    mask = torch.arange(steps).unsqueeze(1) < lengths
+    first_hashes = torch.randint(2**62, (4,))[torch.randint(4, (rows,))]
+    histories = distinct_histories(symbols, starts, mask, num_symbols=2, first_hashes=first_hashes)
+
+    numbers: dict[Any, int] = {}
+    previous: list[Any] = [(first_hashes[n].item(),) for n in range(rows)]
+    first = 0
+    for t in range(steps):
+        current: list[Any] = [None] * rows
+        for n in range(rows):
+            node = histories.nodes[t, n].item()
+            if not mask[t, n]:
+                assert node == -1
+                continue
+            past = () if starts[t, n] else previous[n]
+            current[n] = (*past, (t, symbols[t, n].item()))
+            assert numbers.setdefault(current[n], node) == node
+            place = divmod(histories.rows[node].item(), rows)
+            assert place[0] == t
+            parent = histories.parents[node].item()
+            if starts[t, n]:
+                assert parent == -1
+            elif t:
+                before = histories.nodes[t - 1, n].item()
+                assert parent == before - sum(histories.counts[: t - 1])
+            else:
+                assert first_hashes[parent] == first_hashes[n]
+        first += histories.counts[t]
+        previous = current
+    assert sorted(numbers.values()) == list(range(first))
+    assert first == len(histories.parents) == len(histories.rows)
+
+
+def sequences(kind: str, *batch: int, steps: int) -> TensorDict:
+    """Synthetic inputs `[*batch, steps]` whose rows share histories as `kind` says."""
+    generator = torch.Generator().manual_seed(0)
+    shape = (*batch, steps)
+    observation = torch.randint(NUM_OBSERVATIONS, shape, generator=generator)
+    action = torch.stack([torch.randint(n + 1, shape, generator=generator) for n in NVEC], -1)
+    if kind != "distinct":
+        shared = steps if kind == "equal" else steps // 2
+        observation[..., :shared] = observation.flatten(0, -2)[0, :shared]
+        action[..., :shared, :] = action.flatten(0, -3)[0, :shared]
+    is_init = torch.zeros(*shape, 1, dtype=torch.bool)
+    is_init[..., 0, :] = True
+    data = TensorDict(
+        observation=observation, previous_action=action, is_init=is_init, batch_size=shape
+    )
+    if kind == "restarts":
+        flat = data.reshape(-1, steps)
+        flat["is_init"][1, steps // 3] = True
+        flat["is_init"][2:, 2 * steps // 3] = True
+        data = flat.reshape(shape)
+    return data
+
+
+def both_policies(dtype: torch.dtype = torch.float32, **options: Any) -> tuple[Any, Any]:
+    """The policy by distinct histories and the one by TorchRL's LSTMModule, with equal weights."""
+    policies = []
+    for distinct in (True, False):
+        torch.manual_seed(0)
+        policies.append(
+            make_tuple_policy(
+                NUM_OBSERVATIONS,
+                NVEC,
+                hidden_size=16,
+                dtype=dtype,
+                distinct_histories=distinct,
+                **options,
+            )
+        )
+    for ours, plain in zip(policies[0].parameters(), policies[1].parameters(), strict=True):
+        assert_close(ours, plain, rtol=0, atol=0)
+    return policies[0], policies[1]
+
+
+def logits_and_gradients(policy: Any, data: TensorDict, where: torch.Tensor) -> list[torch.Tensor]:
+    with set_recurrent_mode(True):
+        logits = policy.get_dist(data.clone()).logits
+    weights = torch.randn(
+        logits.shape, dtype=logits.dtype, generator=torch.Generator().manual_seed(1)
+    )
+    objective = torch.where(where.unsqueeze(-1), logits.tanh() * weights, 0).sum()
+    gradients = torch.autograd.grad(objective, list(policy.parameters()))
+    return [logits[where], *gradients]
+
+
+def count_rows(policy: Any) -> list[int]:
+    """A list that grows by the number of rows of each pass through the readout."""
+    rows: list[int] = []
+    readout = policy.module[0].readout
+    readout.register_forward_hook(lambda module, args, output: rows.append(len(output)))
+    return rows
+
+
+def num_distinct(data: TensorDict, mask: torch.Tensor) -> int:
+    """The number of distinct histories, by brute force."""
+    inputs = torch.cat([data["observation"].unsqueeze(-1), data["previous_action"]], -1)
+    histories = set()
+    for row, init, real in zip(
+        inputs.flatten(0, -3).tolist(),
+        data["is_init"].flatten(0, -3).squeeze(-1).tolist(),
+        mask.flatten(0, -2).tolist(),
+        strict=True,
+    ):
+        history: tuple[Any, ...] = ()
+        for t in range(sum(real)):
+            history = (*(() if init[t] else history), (t, *row[t]))
+            histories.add(history)
+    return len(histories)
+
+
+KINDS = ["shared", "equal", "distinct", "restarts"]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("head", HEADS)
+@pytest.mark.parametrize("batch", [(12,), (3, 4)])
+@pytest.mark.parametrize(("kind", "steps"), [*((kind, 9) for kind in KINDS), ("shared", 1)])
+def test_update_equals_the_plain_module(
+    kind: str, steps: int, batch: tuple[int, ...], head: str, dtype: torch.dtype
+) -> None:
+    data = sequences(kind, *batch, steps=steps)
+    where = torch.ones(*batch, steps, dtype=torch.bool)
+    policies = both_policies(dtype, head=head)
+    ours, plain = (logits_and_gradients(policy, data, where) for policy in policies)
+    for a, b in zip(ours, plain, strict=True):
+        assert_close(a, b)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_padding_costs_nothing(kind: str, dtype: torch.dtype) -> None:
+    data = sequences(kind, 3, 4, steps=9)
+    lengths = torch.tensor([9, 8, 5, 1]).expand(3, 4)
+    mask = torch.arange(9) < lengths.unsqueeze(-1)
+    data["collector", "mask"] = mask
+    policy, plain = both_policies(dtype)
+    ours, theirs = (logits_and_gradients(p, data, mask) for p in (policy, plain))
+    for a, b in zip(ours, theirs, strict=True):
+        assert_close(a, b)
+
+    rows = count_rows(policy)
+    with set_recurrent_mode(True):
+        dist = policy.get_dist(data)
+    assert (dist.logits[~mask] == 0).all()
+    assert dist.entropy().isfinite().all()
+    assert rows == [num_distinct(data, mask)]
+
+
+def test_a_trajectory_of_padding_alone() -> None:
+    data = sequences("shared", 5, steps=4)
+    data["collector", "mask"] = torch.ones(5, 4, dtype=torch.bool)
+    data["collector", "mask"][2] = False
+    data["is_init"][2] = False
+    policy, _ = both_policies()
+    with set_recurrent_mode(True):
+        logits = policy.get_dist(data).logits
+    assert (logits[2] == 0).all()
+    assert (logits[3] != 0).any()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_update_from_stored_states(dtype: torch.dtype) -> None:
+    data = sequences("restarts", 6, steps=6)
+    data["is_init"][3:, 0] = False
+    states = {}
+    for name in ("recurrent_state_h", "recurrent_state_c"):
+        first = torch.zeros(6, 1, 16, dtype=dtype)
+        first[3:5] = torch.randn(1, 16, dtype=dtype)
+        first[5] = torch.randn(1, 16, dtype=dtype)
+        states[name] = first.requires_grad_()
+    results = []
+    for policy in both_policies(dtype, store_states=True):
+        copy = data.clone()
+        for name, first in states.items():
+            # LSTMModule takes what it finds where a trajectory starts.
+            copy[name] = torch.cat([first.unsqueeze(1), torch.zeros(6, 5, 1, 16, dtype=dtype)], 1)
+        with set_recurrent_mode(True):
+            logits = policy.get_dist(copy).logits
+        gradients = torch.autograd.grad(logits.square().sum(), list(states.values()))
+        # Rows 3 and 4 are one history, whose gradient goes to one of them; that of rows that
+        # start is none of the state's, as LSTMModule has it.
+        results.append([logits, *(g[3] + g[4] for g in gradients), *(g[5] for g in gradients)])
+    for ours, plain in zip(*results, strict=True):
+        assert_close(ours, plain)
+
+
+def step_inputs(data: TensorDict, t: int, before: TensorDict | None) -> TensorDict:
+    inputs = data[:, t].clone()
+    if before is not None:
+        inputs.update(before["next"].select("recurrent_state_h", "recurrent_state_c"))
+    return inputs
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_sampling_equals_the_plain_module_and_the_update(kind: str, dtype: torch.dtype) -> None:
+    data = sequences(kind, 12, steps=8)
+    results = []
+    for policy in both_policies(dtype):
+        before, logits = None, []
+        for t in range(8):
+            before = policy(step_inputs(data, t, before))
+            logits.append(before["logits"])
+        results.append([torch.stack(logits, 1), before["next", "recurrent_state_h"]])
+        # Through time, step by step: the states carry gradients.
+        results[-1] += torch.autograd.grad(results[-1][0].square().sum(), policy.parameters())
+        with set_recurrent_mode(True):
+            assert_close(policy.get_dist(data.clone()).logits, results[-1][0])
+    for ours, plain in zip(*results, strict=True):
+        assert_close(ours, plain)
+
+
+def test_sampling_survives_reordering_dropping_and_new_weights() -> None:
+    data = sequences("restarts", 12, steps=6)
+    results = []
+    for policy in both_policies():
+        current, before, logits = data, None, []
+        for t in range(6):
+            with torch.no_grad():
+                before = policy(step_inputs(current, t, before))
+                logits.append(before["logits"])
+                for parameter in policy.parameters():
+                    parameter.data.mul_(1.1)
+            rows = torch.randperm(len(current), generator=torch.Generator().manual_seed(t))[:-1]
+            current, before = current[rows], before[rows]
+            # The state also travels between processes.
+            policy, before = pickle.loads(pickle.dumps((policy, before)))
+        results.append(torch.cat(logits))
+    assert_close(*results)
+
+
+def test_sampling_computes_each_history_once() -> None:
+    policy, _ = both_policies()
+    rows = count_rows(policy)
+    data = sequences("shared", 12, steps=8)
+    before = None
+    for t in range(8):
+        inputs = step_inputs(data, t, before)
+        inputs["done"] = torch.zeros(12, 1, dtype=torch.bool)
+        inputs["done"][4:] = t == 7
+        before = policy(inputs)
+    assert rows[:4] == [1] * 4
+    assert rows[6] == 12
+    # Eight rows have ended.
+    assert rows[7] == 5
+
+
+def test_deterministic_exploration_takes_the_mode() -> None:
+    policy, _ = both_policies()
+    data = sequences("distinct", 50, steps=1)[:, 0]
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        action = policy(data.clone())["action"]
+    assert_close(action, policy.get_dist(data.clone()).mode)
+    assert (policy(data.clone())["action"] != action).any()
+
+
+def test_functional_call_and_copies() -> None:
+    policy, _ = both_policies()
+    data = sequences("shared", 6, steps=5)
+    other = deepcopy(policy)
+    for parameter in other.parameters():
+        parameter.data.mul_(0.5)
+    params = TensorDict.from_module(other)
+    with set_recurrent_mode(True):
+        expected = other.get_dist(data.clone()).logits
+        unchanged = policy.get_dist(data.clone()).logits
+        with params.to_module(policy, preserve_module_state=False):
+            logits = policy.get_dist(data.clone()).logits
+        assert_close(logits, expected, rtol=0, atol=0)
+        logits.sum().backward()
+        assert all(p.grad is not None for p in other.parameters())
+        assert all(p.grad is None for p in policy.parameters())
+        assert_close(policy.get_dist(data.clone()).logits, unchanged, rtol=0, atol=0)
+        assert_close(pickle.loads(pickle.dumps(policy)).get_dist(data.clone()).logits, unchanged)
+    assert (expected - unchanged).abs().max() > 1e-3
+    assert not list(policy.buffers())
+
+
+class TapeEnv(EnvBase):
+    """Reads random characters; episodes take 3 to 6 steps; previous actions as observations."""
+
+    def __init__(self, rows: int) -> None:
+        super().__init__(batch_size=torch.Size([rows]))
+        previous = torch.tensor(NVEC) + 1
+        self.observation_spec = Composite(
+            observation=Categorical(NUM_OBSERVATIONS, shape=(rows,)),
+            previous_action=MultiCategorical(previous.repeat(rows, 1), shape=(rows, 3)),
+            left=Categorical(7, shape=(rows,)),
+            shape=(rows,),
+        )
+        self.action_spec = MultiCategorical(torch.tensor(NVEC).repeat(rows, 1), shape=(rows, 3))
+        self.reward_spec = Unbounded(shape=(rows, 1))
+        self.rng = torch.Generator()
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.rng.manual_seed(seed or 0)
+
+    def _observe(self, previous_action: torch.Tensor, left: torch.Tensor) -> TensorDict:
+        return TensorDict(
+            observation=torch.randint(NUM_OBSERVATIONS, self.batch_size, generator=self.rng),
+            previous_action=previous_action.clone(),
+            left=left,
+            done=(left == 0).unsqueeze(-1),
+            batch_size=self.batch_size,
+        )
+
+    def _reset(self, tensordict: Any) -> TensorDict:
+        left = torch.randint(3, 7, self.batch_size, generator=self.rng)
+        return self._observe(torch.tensor(NVEC).expand(*self.batch_size, 3), left)
+
+    def _step(self, tensordict: Any) -> TensorDict:
+        result = self._observe(tensordict["action"], (tensordict["left"] - 1).clamp(min=0))
+        return result.set("reward", torch.zeros(*self.batch_size, 1))
+
+
+def tape_env(policy: Any) -> TransformedEnv:
+    env = TransformedEnv(TapeEnv(8), get_env_transforms_from_module(policy))
+    env.set_seed(0)
+    return env
+
+
+@pytest.mark.parametrize("store_states", [False, True])
+def test_rollout(store_states: bool) -> None:
+    torch.manual_seed(0)
+    policy, _ = both_policies(store_states=store_states)
+    env = tape_env(policy)
+    check_env_specs(env.base_env)
+    data = env.rollout(20, policy, break_when_any_done=False)
+    assert data["is_init"][:, 1:].any()
+    with set_recurrent_mode(True):
+        log_prob = policy.get_dist(data).log_prob(data["action"])
+    assert_close(log_prob, data["action_log_prob"])
+    for key in ("recurrent_state_h", ("next", "recurrent_state_h")):
+        assert (key in data.keys(True)) is store_states
+
+
+@pytest.mark.parametrize("store_states", [False, True])
+@pytest.mark.parametrize("automatic", [False, True])
+def test_collector(automatic: bool, store_states: bool) -> None:
+    torch.manual_seed(0)
+    policy, _ = both_policies(store_states=store_states)
+    collector = Collector(
+        TransformedEnv(TapeEnv(8)) if automatic else tape_env(policy),
+        policy,
+        frames_per_batch=40,
+        total_frames=160,
+        trajs_per_batch=5,
+        traj_format="padded",
+        auto_register_policy_transforms=automatic,
+    )
+    for data in collector:
+        mask = data["collector", "mask"]
+        with set_recurrent_mode(True):
+            log_prob = policy.get_dist(data.exclude("logits")).log_prob(data["action"])
+        assert_close(log_prob[mask], data["action_log_prob"][mask])
+    collector.shutdown()
+
+
+@pytest.mark.parametrize("store_states", [False, True])
+def test_fragments_of_trajectories_need_stored_states(store_states: bool) -> None:
+    policy, _ = both_policies(store_states=store_states)
+    collector = Collector(
+        tape_env(policy),
+        policy,
+        frames_per_batch=16,
+        total_frames=48,
+        auto_register_policy_transforms=False,
+    )
+    *_, data = collector
+    collector.shutdown()
+    assert not data["is_init"][:, 0].all()
+    with set_recurrent_mode(True):
+        if not store_states:
+            with pytest.raises(ValueError, match=r"states are not stored.* store_states=True"):
+                policy.module[0](data)
+            return
+        log_prob = policy.get_dist(data).log_prob(data["action"])
+    assert_close(log_prob, data["action_log_prob"])
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"is_init": None}, KeyError, r"is_init: expected .* append torchrl.envs.InitTracker"),
+        ({"is_init": False}, KeyError, r"expected the states .* make_tensordict_primer\(\)"),
+        (
+            {"observation": 5},
+            ValueError,
+            r"\[0, n\) for n in \(5, 4, 3, 5\), got values from \[5, ",
+        ),
+        ({"observation": -1}, ValueError, r"got values from \[-1, "),
+        ({"previous_action": 3}, ValueError, r"observation.*got values from .*, 3, "),
+    ],
+)
+def test_core_refuses(change: dict[str, Any], error: type[Exception], message: str) -> None:
+    data = sequences("distinct", 4, steps=1)[:, 0].clone()
+    for key, value in change.items():
+        if value is None:
+            del data[key]
+        else:
+            data[key][:] = value
+    with pytest.raises(error, match=message):
+        both_policies()[0].module[0](data)
+
+
+def test_core_refuses_shapes() -> None:
+    lstm = DistinctHistoryLSTM([5, 4], 8, in_keys=["observation", "previous_action"])
+    data = sequences("distinct", 4, steps=1)[:, 0]
+    with pytest.raises(ValueError, match=r"expected 2 integers in all.* got 4"):
+        lstm(data)
+    with set_recurrent_mode(True), pytest.raises(ValueError, match="time last, in recurrent mode"):
+        make_tuple_policy(NUM_OBSERVATIONS, NVEC, hidden_size=8).module[0](data[0])
+    with pytest.raises(ValueError, match=r"product of at most 2\^31, got \(65536, 65536\)"):
+        DistinctHistoryLSTM([2**16, 2**16], 8, in_keys=["observation"])
+
+
+def test_policy_refuses() -> None:
+    with pytest.raises(ValueError, match="head: expected"):
+        make_tuple_policy(5, NVEC, head="tuple")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="nvec: expected"):
+        make_tuple_policy(5, (2, 5))
