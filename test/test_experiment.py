@@ -66,9 +66,9 @@ def test_rows_are_on_disk_as_soon_as_they_are_logged(tmp_path):
 
 
 def test_an_interrupted_run_keeps_its_record_and_says_so(tmp_path):
-    with pytest.raises(KeyboardInterrupt), make_run(tmp_path) as run:
-        record(run)
-        raise KeyboardInterrupt
+    run = make_run(tmp_path)
+    record(run)
+    run.__exit__(KeyboardInterrupt, KeyboardInterrupt(), None)
     assert json.loads((tmp_path / "summary.json").read_text())["finished"] is False
     assert len(read_metrics(tmp_path)["step"]) == 3
     assert (tmp_path / "curve.png").exists()
@@ -76,10 +76,11 @@ def test_an_interrupted_run_keeps_its_record_and_says_so(tmp_path):
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_loss_that_is_not_finite_stops_the_run_and_is_recorded(tmp_path, value):
+    run = make_run(tmp_path)
+    run.log({"loss_actor": 1.0}, step=10)
     with pytest.raises(FloatingPointError, match=f"loss_actor is {value} at trajectories 20"):
-        with make_run(tmp_path) as run:
-            run.log({"loss_actor": 1.0}, step=10)
-            run.log({"loss_actor": value}, step=20)
+        run.log({"loss_actor": value}, step=20)
+    run.__exit__(None, None, None)
     assert len(read_metrics(tmp_path)["step"]) == 2
 
 

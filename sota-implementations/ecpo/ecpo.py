@@ -5,12 +5,11 @@
 
 from __future__ import annotations
 
-import copy
-
 import hydra
 import torch
 from omegaconf import DictConfig
-from utils import make_collector, make_loss, make_task, make_temperatures
+from tasks import make_task
+from utils import make_collector, make_loss, make_temperatures, reached
 
 from torchrl_ecpo.experiment import Run
 
@@ -21,28 +20,26 @@ def main(config: DictConfig) -> None:
     torch.manual_seed(config.seed)
 
     task = make_task(config)
-    actor = task.actor
-    reference = copy.deepcopy(actor)
-    collector = make_collector(config, task.env, reference)
-    loss_module = make_loss(config.loss, actor)
+    collector = make_collector(config, task)
+    loss_module = make_loss(config.loss, task.actor)
     temperatures = make_temperatures(config.loss, loss_module)
     optimizer = torch.optim.Adam(loss_module.parameters(), lr=config.optim.lr, eps=config.optim.eps)
     max_grad_norm = config.optim.max_grad_norm or float("inf")
 
     groups_of_trajectories = iter(collector)
-    trajectories = 0
-    project_step = 0
+    trajectories = project_steps = 0
+    is_annealing = config.anneal_from is None
     with Run(
         config,
         total=config.total_trajectories,
         unit="trajectories",
         name=f"{config.env.name}/{config.loss.name}/seed_{config.seed}",
         shown=task.shown,
-        plotted=task.plotted,
+        plotted=task.shown,
     ) as run:
         while trajectories < config.total_trajectories:
             # Lift: the current policy becomes the reference.
-            collector.update_policy_weights_(loss_module.actor_network_params.data)
+            collector.update_policy_weights_()
             lifted_at = trajectories
             for _ in range(config.project_steps):
                 # Project: one gradient step on fresh trajectories of the reference.
@@ -50,16 +47,19 @@ def main(config: DictConfig) -> None:
                 losses = loss_module(groups)
                 optimizer.zero_grad()
                 losses["loss_actor"].backward()
-                grad_norm = torch.nn.utils.clip_grad_norm_(actor.parameters(), max_grad_norm)
+                grad_norm = torch.nn.utils.clip_grad_norm_(loss_module.parameters(), max_grad_norm)
                 optimizer.step()
 
                 trajectories += config.num_groups * config.group_size
-                project_step += 1
-                metrics = {**losses.detach(), "grad_norm": grad_norm, **temperatures.values()}
-                if project_step % config.evaluation_interval == 0:
-                    metrics |= task.evaluate()
+                project_steps += 1
+                metrics = {**losses.detach(), **task.measure(groups), **temperatures.values()}
+                metrics["grad_norm"] = grad_norm
+                if project_steps % config.evaluation_interval == 0:
+                    metrics |= task.evaluate(groups)
                 run.log(metrics, step=trajectories)
-            temperatures.step(trajectories - lifted_at)
+            is_annealing = is_annealing or reached(config.anneal_from, metrics)
+            if is_annealing:
+                temperatures.step(trajectories - lifted_at)
     collector.shutdown()
 
 

@@ -7,7 +7,7 @@ from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
 from torchrl_ecpo.envs import BanditEnv
-from torchrl_ecpo.softmax_policy import make_softmax_policy
+from torchrl_ecpo.modules import make_softmax_policy
 
 
 @pytest.mark.parametrize("transforms", [(), (StepCounter, RewardSum)])

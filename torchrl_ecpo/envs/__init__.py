@@ -2,5 +2,6 @@
 
 from torchrl_ecpo.envs.algorithmic import TASKS, AlgorithmicEnv, AlgorithmicTask
 from torchrl_ecpo.envs.bandit import BanditEnv
+from torchrl_ecpo.envs.grouped import GroupedEnv
 
-__all__ = ["TASKS", "AlgorithmicEnv", "AlgorithmicTask", "BanditEnv"]
+__all__ = ["TASKS", "AlgorithmicEnv", "AlgorithmicTask", "BanditEnv", "GroupedEnv"]

@@ -100,7 +100,7 @@ def load_comparison(
     for method, pairs in curves.items():
         first = max(steps[0] for steps, _ in pairs)
         last = min(steps[-1] for steps, _ in pairs)
-        grid = np.linspace(first, last, points)
+        grid = np.linspace(last, first, points)[::-1]  # the last step, if there is only one point
         values = [v[np.searchsorted(steps, grid, side="right") - 1] for steps, v in pairs]
         common[method] = (grid, np.stack(values))
     return Comparison(metric, common)

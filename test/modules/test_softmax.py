@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torch.distributions import Categorical
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_ecpo.softmax_policy import LinearSoftmax, SharedCategorical, make_softmax_policy
+from torchrl_ecpo.modules import LinearSoftmax, SharedCategorical, make_softmax_policy
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -20,8 +20,8 @@ from torchrl.envs import (
 )
 from torchrl.modules import get_env_transforms_from_module, set_recurrent_mode
 
-from torchrl_ecpo._histories import distinct_histories, hash_states, mix
 from torchrl_ecpo.modules import DistinctHistoryLSTM, TupleCategorical, make_tuple_policy
+from torchrl_ecpo.modules.histories import distinct_histories, hash_states, mix
 
 HEADS = ["masked", "unmasked", "joint"]
 DTYPES = [torch.float32, torch.float64]

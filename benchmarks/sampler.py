@@ -1,0 +1,92 @@
+"""Time and memory of `TrajectoryGroupSampler` for storages of 1e4 to 1e6 steps.
+
+Run: python benchmarks/sampler.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+import tracemalloc
+from collections.abc import Callable
+from statistics import median
+
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from torchrl_ecpo.data import TrajectoryGroupSampler
+
+GROUP_SIZE, NUM_GROUPS = 10, 40
+MEAN_LENGTH = 10
+
+
+def make_groups(first_group: int, num_steps: int) -> TensorDict:
+    """About `num_steps` steps of complete groups, as a collector writes them."""
+    num_trajectories = max(num_steps // MEAN_LENGTH // GROUP_SIZE, 1) * GROUP_SIZE
+    length = torch.randint(1, 2 * MEAN_LENGTH, (num_trajectories,))
+    trajectory = torch.arange(num_trajectories).repeat_interleave(length)
+    done = torch.zeros(len(trajectory), 1, dtype=torch.bool)
+    done[length.cumsum(0) - 1] = True
+    return TensorDict(
+        {
+            "observation": torch.randn(len(trajectory), 8),
+            "group": first_group + trajectory // GROUP_SIZE,
+            "collector": {"traj_ids": first_group * GROUP_SIZE + trajectory},
+            "next": {"done": done, "reward": torch.randn(len(trajectory), 1)},
+        },
+        [len(trajectory)],
+    )
+
+
+def milliseconds(run: Callable[[], object], repeats: int) -> float:
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - start)
+    return 1e3 * median(times)
+
+
+def measure(size: int, repeats: int) -> tuple[float, ...]:
+    """Return the cost of filling, writing and drawing with a storage of `size` steps."""
+    sampler = TrajectoryGroupSampler(group_size=GROUP_SIZE)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(size), sampler=sampler, batch_size=NUM_GROUPS * GROUP_SIZE
+    )
+    written = 0
+    while written < size:
+        buffer.extend(make_groups(written, min(size, 100_000)))
+        written += 100_000
+    batch = make_groups(10**9, NUM_GROUPS * GROUP_SIZE * MEAN_LENGTH)
+    write = milliseconds(lambda: buffer.extend(batch), repeats)
+    storage = buffer.storage
+    draw = milliseconds(lambda: sampler.sample(storage, NUM_GROUPS * GROUP_SIZE), repeats)
+    sample = milliseconds(buffer.sample, repeats)
+    tracemalloc.start()
+    for _ in range(3):
+        sampler.sample(storage, NUM_GROUPS * GROUP_SIZE)
+    peak = tracemalloc.get_traced_memory()[1] / 1e6
+    tracemalloc.stop()
+    tables = (sampler._length, sampler._group, sampler._owner)
+    index = sum(table.numel() * table.element_size() for table in tables) / 1e6
+    return write, draw, sample, peak, index
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sizes", type=float, nargs="+", default=[1e4, 3e4, 1e5, 3e5, 1e6])
+    parser.add_argument("--repeats", type=int, default=100)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    print(f"{NUM_GROUPS} groups of {GROUP_SIZE} trajectories a draw and a write, one thread")
+    columns = ("steps", "write ms", "draw ms", "sample ms", "draw MB", "tables MB")
+    print("".join(f"{column:>11}" for column in columns))
+    for size in map(int, arguments.sizes):
+        figures = measure(size, arguments.repeats)
+        print(f"{size:>11,}" + "".join(f"{figure:>11.2f}" for figure in figures))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,215 @@
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import (
+    Compose,
+    DMControlEnv,
+    DoubleToFloat,
+    GymEnv,
+    InitTracker,
+    PendulumEnv,
+    RewardSum,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_ecpo.data import TrajectoryGroupSampler
+from torchrl_ecpo.envs.grouped import GroupedEnv
+
+# A function of this module could not be imported by worker processes.
+cartpole = partial(GymEnv, "CartPole-v1")
+
+
+MAKERS = {
+    "CartPole-v1": (cartpole, "observation"),
+    "Pendulum-v1": (lambda: GymEnv("Pendulum-v1"), "observation"),
+    "dm_control cartpole": (lambda: DMControlEnv("cartpole", "balance"), "position"),
+    "torch": (PendulumEnv, "th"),
+    "transformed": (lambda: TransformedEnv(cartpole(), StepCounter(max_steps=5)), "observation"),
+}
+
+
+@pytest.fixture(autouse=True)
+def headless(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "disabled")
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_copies_start_from_the_same_state(maker):
+    make, key = MAKERS[maker]
+    env = GroupedEnv(make, num_groups=2, group_size=3)
+    groups, starts = [], []
+    for _ in range(3):
+        start = env.reset()
+        assert start.shape == (2, 3)
+        assert (start[key] == start[key][:, :1]).all()
+        assert (start["group"] == start["group"][:, :1]).all()
+        groups.append(start["group"][:, 0])
+        starts.append(start[key][:, 0].double().reshape(2, -1))
+        env.rollout(2, auto_reset=False, tensordict=start)
+    assert torch.cat(groups).unique().numel() == 6
+    assert torch.cat(starts).unique(dim=0).shape[0] == 6
+    env.close()
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_specs_and_transforms(maker):
+    make, _ = MAKERS[maker]
+    env = GroupedEnv(make, num_groups=2, group_size=2)
+    check_env_specs(env, seed=0)
+    if maker != "transformed":
+        transforms = [InitTracker(), RewardSum(), StepCounter(max_steps=4), DoubleToFloat()]
+        env = TransformedEnv(env, Compose(*transforms))
+        check_env_specs(env, seed=0)
+    rollout = env.rollout(12, break_when_any_done=False)
+    assert rollout.shape == (2, 2, 12)
+    assert rollout["next", "done"].any()
+    # The group changes where an episode starts, and nowhere else.
+    changed = rollout["group"][..., 1:] != rollout["group"][..., :-1]
+    assert (changed == rollout["next", "done"][..., :-1, 0]).all()
+    assert (rollout["next", "group"] == rollout["group"]).all()
+    env.close()
+
+
+def test_nth_episodes_agree_though_copies_reset_at_different_times():
+    env = GroupedEnv(cartpole, num_groups=2, group_size=3)
+    rollout = env.rollout(120, break_when_any_done=False)
+    first = torch.cat(
+        [torch.ones(2, 3, 1, dtype=torch.bool), rollout["next", "done"][..., :-1, 0]], -1
+    )
+    seen = {}
+    for row in range(2):
+        for copy in range(3):
+            starts = rollout[row, copy][first[row, copy]]
+            for group, start in zip(starts["group"].tolist(), starts["observation"], strict=True):
+                seen.setdefault(group, []).append((row, start))
+    assert max(map(len, seen.values())) == 3
+    for starts in seen.values():
+        assert len({row for row, _ in starts}) == 1
+        assert all(torch.equal(start, starts[0][1]) for _, start in starts)
+    # The second episodes did start at different times.
+    second = (first.cumsum(-1) == 2).int().argmax(-1)
+    assert second.unique().numel() > 2
+    full = env.reset()
+    assert (full["group"] == full["group"][:, :1]).all()
+    assert set(full["group"].unique().tolist()).isdisjoint(seen)
+    env.close()
+
+
+def test_seed_decides_the_instances():
+    env, other = (GroupedEnv(cartpole, num_groups=2, group_size=2) for _ in range(2))
+
+    def starts(env, seed):
+        env.set_seed(seed)
+        return torch.stack([env.reset()["observation"] for _ in range(2)])
+
+    assert (starts(env, 3) == starts(other, 3)).all()
+    assert (starts(env, 3) != starts(other, 4)).any()
+    groups = [e.reset()["group"][0, 0].item() for e in (env, other)]
+    env.set_seed(3)
+    groups.append(env.reset()["group"][0, 0].item())
+    assert len(set(groups)) == 3  # the same start under the same seed is another instance
+    env.close()
+    other.close()
+
+
+@pytest.mark.parametrize("make", [cartpole, PendulumEnv])
+def test_reset_leaves_the_random_state_alone(make):
+    env = GroupedEnv(make, num_groups=2, group_size=2)
+    env.reset()  # the copies are made here
+    torch.manual_seed(0)
+    expected = torch.rand(3)
+    torch.manual_seed(0)
+    env.reset()
+    env.reset()
+    assert (torch.rand(3) == expected).all()
+    env.close()
+
+
+def test_partial_steps_leave_the_others_where_they_are():
+    env = GroupedEnv(cartpole, num_groups=1, group_size=2)
+    start = env.reset()
+    td = env.rand_action(start.clone())
+    step = torch.tensor([[[True], [False]]])
+    following = env.step(td.set("_step", step))["next"]
+    moved = (following["observation"] != start["observation"]).any(-1)
+    assert moved.tolist() == [[True, False]]
+    env.close()
+
+
+def test_parallel():
+    env = GroupedEnv(cartpole, num_groups=1, group_size=2, parallel=True)
+    serial = GroupedEnv(cartpole, num_groups=1, group_size=2)
+    for e in (env, serial):
+        e.set_seed(1)
+    rollouts = [
+        e.rollout(
+            40,
+            policy=lambda td: td.set("action", torch.tensor([[[0, 1], [1, 0]]])),
+            break_when_any_done=False,
+        )
+        for e in (env, serial)
+    ]
+    assert (rollouts[0]["observation"] == rollouts[1]["observation"]).all()
+    assert (rollouts[0]["next", "done"].sum(-2) > 1).all()
+    env.close()
+    serial.close()
+
+
+def test_collector_and_sampler():
+    env = TransformedEnv(GroupedEnv(cartpole, num_groups=2, group_size=3), StepCounter())
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(1000),
+        sampler=TrajectoryGroupSampler(group_size=3),
+        batch_size=6,
+    )
+    collector = Collector(
+        env,
+        frames_per_batch=60,
+        total_frames=1200,
+        trajs_per_batch=1,
+        replay_buffer=buffer,
+    )
+    for _ in collector:
+        if not buffer.can_sample():
+            continue
+        sample = buffer.sample()
+        mask = sample["collector", "mask"]
+        assert (sample["step_count"][..., 0, :] == 0).all()
+        first = sample["observation"][..., 0, :]
+        assert (first == first[:, :1]).all()
+        assert (sample["group"] == sample["group"][:, :1, :1]).all()
+        assert (sample["next", "done"].squeeze(-1) & mask).sum(-1).eq(1).all()
+    assert buffer.can_sample()
+
+
+@pytest.mark.parametrize(
+    ("make", "sizes", "match"),
+    [
+        (cartpole, (1, 1), "num_groups=1, group_size=1"),
+        (cartpole, (0, 2), "num_groups=0"),
+        (lambda: SerialEnv(2, cartpole), (1, 2), r"batch size \(\), got \(2,\)"),
+    ],
+)
+def test_bad_input(make, sizes, match):
+    with pytest.raises(ValueError, match=match):
+        GroupedEnv(make, num_groups=sizes[0], group_size=sizes[1])
+
+
+def test_reset_td_without_group_keeps_it():
+    env = GroupedEnv(cartpole, num_groups=1, group_size=2)
+    start = env.reset()
+    mask = torch.tensor([[[True], [False]]])
+    again = env.reset(start.clone().set("_reset", mask))
+    assert again["group"][0, 1] == start["group"][0, 1]
+    assert again["group"][0, 0] != start["group"][0, 0]
+    assert isinstance(again, TensorDict)
+    env.close()

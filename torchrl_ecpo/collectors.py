@@ -1,0 +1,541 @@
+"""Collectors that yield complete trajectory groups.
+
+Shapes: `G` groups, `K` trajectories of each, `T` steps of the longest one, `S` steps of all
+trajectories together; the environment has the batch size `[*B, K]` with `prod(B)` groups.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence, Set
+from copy import deepcopy
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from torch import Tensor, nn
+from torchrl.collectors import Collector, MultiAsyncCollector, MultiCollector, MultiSyncCollector
+from torchrl.collectors.utils import _maybe_normalize_replay_buffer_tensordict_device
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import set_exploration_type
+from torchrl.modules import RandomPolicy
+
+from torchrl_ecpo.data import GROUP_KEY, TRAJECTORY_KEY, pack_groups
+
+__all__ = ["TrajectoryGroupCollector"]
+
+_DONE_NAMES = ("done", "terminated", "truncated")
+
+# Collector's own arguments that group collection leaves no room for, and why.
+_REFUSED = {
+    "frames_per_batch": "a batch is counted in groups: num_groups and group_size",
+    "trajs_per_batch": "a batch is counted in groups: num_groups and group_size",
+    "traj_format": "batches are padded; a replay buffer is written flat",
+    "split_trajs": "trajectories are not split",
+    "init_random_frames": "every action comes from the policy",
+    "set_truncated": "trajectories are never cut at the end of a batch",
+    "preemptive_threshold": "a batch holds whole trajectories only",
+    "use_buffers": "batches differ in length",
+    "cat_results": "the groups of all workers are concatenated",
+    "return_same_td": "every batch is new",
+    "extend_buffer": "a buffer is written one batch at a time",
+    "reset_at_each_iter": "all trajectories of a batch start with it",
+    "track_traj_ids": "trajectories always have ids",
+    "cudagraph_policy": "the number of rows that the policy sees changes",
+}
+
+
+class _GroupCollectorMeta(type(Collector)):
+    """Makes the collector of the backend asked for, as TorchRL's metaclass does for its own."""
+
+    def __call__(
+        cls,
+        *args: Any,
+        backend: str | None = None,
+        num_collectors: int | None = None,
+        sync: bool | None = None,
+        **kwargs: Any,
+    ) -> Any:
+        several = isinstance(args[0] if args else kwargs.get("create_env_fn"), Sequence)
+        if backend is None:
+            backend = "process" if several or num_collectors is not None else "direct"
+        if backend == "process":
+            return _make_multi_collector(*args, num_collectors=num_collectors, sync=sync, **kwargs)
+        if backend != "direct":
+            raise ValueError(
+                f"backend={backend!r} does not collect groups; 'direct' and 'process' do."
+            )
+        if several or num_collectors is not None or sync is not None:
+            raise ValueError(
+                "sync, num_collectors and lists of environment makers are for worker processes: "
+                "sync needs num_collectors, the number of workers."
+            )
+        return super().__call__(*args, **kwargs)
+
+
+class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
+    """Collects complete groups: `K` trajectories of each of `G` problem instances, `[G, K, T]`.
+
+    Takes what TorchRL's ``Collector`` takes, except what would cut trajectories, and:
+
+    - yields batches `[G, K, T]` padded to the longest trajectory, with ``("collector", "mask")``,
+      or, given a `replay_buffer`, writes their steps flat, for :class:`TrajectoryGroupSampler`;
+    - is on-policy by the letter of Algorithm 1: all trajectories of a batch come from the same
+      weights. The collector samples from a copy of the policy, the reference, which changes only
+      when :meth:`update_policy_weights_` is called, on every backend. If that happens within a
+      batch, its trajectories are restarted, and counted in :attr:`restarted_trajectories`;
+    - spends nothing on trajectories that have ended: the policy sees the rows of the others, and
+      the environment gets ``"_step"``. Nothing runs across batches, so nothing is thrown away.
+
+    A batch keeps what the environment and the policy wrote at each step, with two exceptions. What
+    the policy hands to its own next step, ``("next", ...)`` such as the state of an LSTM, is left
+    out: a loss recomputes it from ``is_init``. Of the environment's ``("next", ...)``, by default
+    only reward and done flags stay (`compact_obs`).
+
+    Args:
+        create_env_fn: the environment, or what makes it, of batch size `[*B, K]`; a list of makers
+            for as many worker processes.
+        policy: what acts. Default: random actions.
+        num_groups: `G`, a multiple of the environment's `prod(B)` (of all workers', with `sync`).
+        group_size: `K`, at least 2.
+        backend: ``"direct"``, in this process, or ``"process"``, in worker processes. Default: the
+            latter if workers are asked for.
+        num_collectors: run this many worker processes. Default: none, or one for each of a list
+            of makers.
+        sync: with workers, whether a batch is made of all workers' groups, collected at the same
+            time (True), or of those of one worker, while the others go on (False, the default, as
+            TorchRL's). With False, `G` is that of each worker's batch, and a batch may come from
+            the weights before the last update, though never from both.
+        total_frames: stop when this many real steps have been collected. Default: -1, never.
+        compact_obs: whether to leave observations out of ``"next"``: they are those of the next
+            step. Default: True. A critic that needs the last one wants False.
+        exclude_keys: more entries to leave out, such as logits and features that a loss computes
+            anew.
+        max_steps: the length at which a trajectory is taken to be endless. Default: 10,000.
+        group_key: the environment's key of the problem instance.
+        kwargs: everything else that ``Collector`` takes, such as `policy_factory`, devices,
+            `max_frames_per_traj`, `exploration_type`, `postproc`, `replay_buffer`,
+            `compile_policy`.
+
+    Raises:
+        TypeError: for an argument that does not go with groups.
+        ValueError: if `K` is below 2 or not the environment's, if `G` is no multiple, or if the
+            environment makes groups of another size.
+        KeyError: if the environment has no `group_key`.
+        RuntimeError: if a trajectory does not end within `max_steps`.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> from torchrl_ecpo.envs.grouped import GroupedEnv
+        >>> env = GroupedEnv(lambda: GymEnv("CartPole-v1"), num_groups=2, group_size=3)
+        >>> collector = TrajectoryGroupCollector(env, num_groups=4, group_size=3)
+        >>> batch = next(iter(collector))
+        >>> batch.shape[:2], batch["group"][..., 0].unique().numel()
+        (torch.Size([4, 3]), 4)
+        >>> length = batch["collector", "mask"].sum(-1)
+        >>> bool((length == batch["next", "reward"].sum((-2, -1))).all())
+        True
+        >>> collector.shutdown()
+    """
+
+    def __init__(
+        self,
+        create_env_fn: EnvBase | Callable[[], EnvBase] | Sequence[Callable[[], EnvBase]],
+        policy: Callable[[TensorDictBase], TensorDictBase] | None = None,
+        *,
+        num_groups: int,
+        group_size: int,
+        backend: str | None = None,
+        num_collectors: int | None = None,
+        sync: bool | None = None,
+        total_frames: int = -1,
+        compact_obs: bool = True,
+        exclude_keys: Sequence[NestedKey] = (),
+        max_steps: int = 10_000,
+        group_key: NestedKey = GROUP_KEY,
+        **kwargs: Any,
+    ) -> None:
+        """Make the collector; the class describes the arguments."""
+        del backend, num_collectors, sync  # the metaclass has read them
+        _check_arguments(num_groups, group_size, kwargs)
+        self.num_groups, self.group_size = num_groups, group_size
+        self.exclude_keys = set(map(unravel_key, exclude_keys))
+        self.max_steps, self.group_key = max_steps, group_key
+        self._restarted = torch.zeros((), dtype=torch.int64)
+        self._weight_updates = 0
+        self._yield_flat = kwargs.get("replay_buffer") is not None
+        kwargs.setdefault("auto_register_policy_transforms", True)
+        super().__init__(
+            create_env_fn,  # pyright: ignore[reportArgumentType]
+            policy,  # pyright: ignore[reportArgumentType]
+            frames_per_batch=1,
+            use_buffers=False,
+            compact_obs=compact_obs,
+            **kwargs,
+        )
+        if total_frames >= 0:  # TorchRL's own setter warns unless it is a multiple of a batch
+            self.total_frames = total_frames
+        try:
+            self._check_env()
+        except Exception:
+            self.shutdown(raise_on_error=False)
+            raise
+
+    def _check_env(self) -> None:
+        env = self.env
+        batch = env.batch_size
+        if not batch or batch[-1] != self.group_size:
+            raise ValueError(
+                f"The environment must have the batch size [*B, group_size={self.group_size}], got "
+                f"{tuple(batch)}. GroupedEnv makes groups of any environment."
+            )
+        if self.num_groups % (batch.numel() // self.group_size):
+            raise ValueError(
+                f"num_groups={self.num_groups} must be a multiple of the number of groups that the "
+                f"environment plays at a time, {batch.numel() // self.group_size}."
+            )
+        if self.group_key not in env.full_observation_spec.keys(True, True):
+            raise KeyError(
+                f"The environment has no {self.group_key!r}, the problem instance of each row; it "
+                f"has {sorted(map(str, env.full_observation_spec.keys(True, True)))}. GroupedEnv "
+                "adds it to any environment."
+            )
+        if "done" not in env.done_keys:
+            raise KeyError(f"The environment must have one 'done' a row, it has {env.done_keys}.")
+        acted_on = (env.full_action_spec, env.full_state_spec)
+        seen = (env.full_observation_spec, env.full_done_spec)
+        self._env_keys = [key for spec in (*acted_on, *seen) for key in spec.keys(True, True)]
+
+    def _setup_frames_per_batch(self, frames_per_batch: int) -> None:
+        """Steps are not counted ahead: one at a time, in all rows."""
+        self.frames_per_batch, self.requested_frames_per_batch = frames_per_batch, self.n_env
+
+    def _get_policy_and_device(self, policy: Any = None, **kwargs: Any) -> tuple[Any, Any]:
+        """Take a copy of the policy, so that training it does not change who acts."""
+        moved, get_weights = super()._get_policy_and_device(policy, **kwargs)
+        if moved is policy and isinstance(policy, nn.Module):
+            moved = deepcopy(policy)
+        return moved, get_weights
+
+    def update_policy_weights_(self, *args: Any, **kwargs: Any) -> None:
+        """Copy the weights of the policy, or those given, to the reference that acts."""
+        super().update_policy_weights_(*args, **kwargs)
+        self._weight_updates += 1
+
+    def iterator(self) -> Iterator[TensorDictBase | None]:
+        """Yield batches, or None after each that is written to the replay buffer."""
+        while self._frames < self.total_frames:
+            self._iter += 1
+            steps = self.rollout()
+            self._increment_frames(steps.numel())
+            batch = self._postproc(self._format(steps))
+            if self.post_collect_hook is not None:
+                self.post_collect_hook(batch)
+            if self.replay_buffer is None:
+                yield batch
+                continue
+            batch = _maybe_normalize_replay_buffer_tensordict_device(batch, self.replay_buffer)
+            self.replay_buffer.extend(batch)
+            yield None
+
+    def _format(self, steps: TensorDictBase) -> TensorDictBase:
+        if self._yield_flat:
+            return steps
+        return pack_groups(steps, group_size=self.group_size, group_key=self.group_key)
+
+    @torch.no_grad()
+    def rollout(self) -> TensorDictBase:
+        """Collect the steps `[S]` of a batch, trajectory after trajectory, group after group."""
+        if self.pre_collect_hook is not None:
+            self.pre_collect_hook()
+        while True:
+            updates, weights = self._weight_updates, self._copy_weights()
+            rounds: list[TensorDictBase | None] = []
+            while len(rounds) * self.n_env < self.num_groups * self.group_size:
+                rounds.append(self._play_round(updates))
+                if rounds[-1] is None:
+                    break
+            # A worker's weights are written by another thread: the count of updates may come late.
+            if rounds[-1] is not None and self._has_weights(weights):
+                batch: Any = TensorDict.cat(rounds)
+                return batch
+            self._restarted += len(rounds) * self.n_env
+
+    def _copy_weights(self) -> list[Tensor]:
+        module = self.policy if isinstance(self.policy, nn.Module) else nn.Module()
+        return [parameter.detach().clone() for parameter in module.parameters()]
+
+    def _has_weights(self, weights: list[Tensor]) -> bool:
+        now = self._copy_weights()
+        return all(
+            torch.allclose(new, old, rtol=0.0, atol=0.0, equal_nan=True)
+            for new, old in zip(now, weights, strict=True)
+        )
+
+    def _play_round(self, updates: int) -> TensorDictBase | None:
+        """Play one trajectory in each row; None if the weights were updated meanwhile."""
+        root = self.env.reset()
+        group = self._check_groups(root)
+        rows = torch.arange(self.n_env, device=group.device)  # those that have not ended
+        history: _History | None = None
+        waiting = root  # what the environment reads, in all rows
+        with set_exploration_type(self.exploration_type):
+            for _ in range(self.max_steps):
+                if self._weight_updates != updates:
+                    return None
+                root = self._act(root, rows)
+                handed_on = root.get("next", None)
+                root = self._step_env(root, waiting, rows)
+                if history is None:
+                    dropped = () if handed_on is None else handed_on.keys(True, True)
+                    dropped = self.exclude_keys.union(dropped)
+                    history = _History(_recorded_keys(root, dropped, self.compact_obs))
+                history.append(root, rows)
+                done = root["next", "done"].reshape(-1)
+                following = self.env.step_mdp(root)
+                if done.any():
+                    if done.all():
+                        return self._finish(history, group)
+                    if len(rows) == self.n_env:
+                        waiting = root.select(*self._env_keys, strict=False).clone()
+                        following = following.reshape(-1)
+                    going_on = (~done).nonzero().squeeze(-1)
+                    rows, following = rows[going_on], following[going_on]
+                root = following
+        raise RuntimeError(
+            f"{len(rows)} trajectories, the first one of group {int(group.reshape(-1)[rows[0]])}, "
+            f"have not ended after max_steps={self.max_steps} steps. Limit their length: append "
+            "StepCounter(max_steps=...) to the environment, or pass max_frames_per_traj."
+        )
+
+    def _check_groups(self, root: TensorDictBase) -> Tensor:
+        group = root[self.group_key]
+        rows = group.reshape(-1, self.group_size) if group.shape == root.shape else None
+        if rows is None or (rows != rows[:, :1]).any() or len(rows[:, 0].unique()) < len(rows):
+            raise ValueError(
+                f"After a reset, {self.group_key!r} must be one integer for each row, equal for "
+                f"the group_size={self.group_size} copies of an instance and different from those "
+                f"of the others, got {group.tolist()}."
+            )
+        return group
+
+    def _act(self, root: TensorDictBase, rows: Tensor) -> TensorDictBase:
+        """Let the policy act in `root`, which holds the active rows."""
+        if isinstance(self.policy, RandomPolicy):
+            action = self.policy(TensorDict(batch_size=self.env.batch_size, device=root.device))
+            return root.update(action if len(rows) == self.n_env else action.reshape(-1)[rows])
+        cast = self._cast_to_policy_device and self.policy_device is not None
+        seen = root.to(self.policy_device) if cast else root
+        acted: Any = self._wrapped_policy(seen)
+        return root.update(acted.to(root.device) if cast else acted)
+
+    def _step_env(
+        self, root: TensorDictBase, waiting: TensorDictBase, rows: Tensor
+    ) -> TensorDictBase:
+        """Step the active rows, which `root` holds; `waiting` has what the others stopped at."""
+        if len(rows) == self.n_env:
+            return self.env.step(root)
+        batch = self.env.batch_size
+        where = torch.unravel_index(rows, batch)
+        waiting[where] = root.select(*self._env_keys, strict=False)
+        active = torch.zeros(*batch, 1, dtype=torch.bool, device=rows.device)
+        active[where] = True
+        following = self.env.step(waiting.copy().set("_step", active)).get("next")[where]
+        # What the policy hands to its own next step prevails, as in a step of all rows.
+        return root.set("next", following.update(root.get("next", TensorDict())))
+
+    def _finish(self, history: _History, group: Tensor) -> TensorDictBase:
+        steps, row = history.by_row()
+        ids = self._traj_pool.get_traj_and_increment(self.n_env, device=row.device)
+        steps.set(self.group_key, group.reshape(-1)[row]).set(TRAJECTORY_KEY, ids[row])
+        device = self.storing_device
+        return steps if device is None else steps.to(device)
+
+    @property
+    def restarted_trajectories(self) -> int:
+        """Trajectories begun and thrown away because the weights changed within a batch."""
+        return int(self._restarted)
+
+
+def _recorded_keys(
+    step: TensorDictBase, dropped: Set[NestedKey], compact_obs: bool
+) -> list[NestedKey]:
+    """Choose what a batch keeps of a step: nothing `dropped`, nothing private.
+
+    With `compact_obs`, an observation is kept where it is acted upon and not where it results.
+    """
+    kept: list[NestedKey] = []
+    keys = list(step.keys(True, True))
+    present = set(keys)
+    for key in keys:
+        path = key if isinstance(key, tuple) else (key,)
+        is_next = path[0] == "next"
+        entry = unravel_key(path[1:] if is_next else path)
+        if not dropped.isdisjoint((key, entry)) or any(part.startswith("_") for part in path):
+            continue
+        if is_next and compact_obs and entry in present and path[-1] not in _DONE_NAMES:
+            continue
+        kept.append(key)
+    return kept
+
+
+class _History:
+    """The steps of a round: of all rows at first, of fewer and fewer later."""
+
+    def __init__(self, keys: list[NestedKey]) -> None:
+        self._keys = keys
+        self._whole: list[TensorDictBase] = []  # [*B, K] each
+        self._partial: list[TensorDictBase] = []  # [n] each
+        self._rows: list[Tensor] = []  # of both, [n] each
+
+    def append(self, root: TensorDictBase, rows: Tensor) -> None:
+        step = root.select(*self._keys)
+        whole = not self._whole or root.shape == self._whole[0].shape
+        (self._whole if whole else self._partial).append(step)
+        self._rows.append(rows)
+
+    def by_row(self) -> tuple[Any, Tensor]:
+        """Return the steps `[S]`, trajectory after trajectory, and the row of each."""
+        whole: Any = TensorDict.stack(self._whole)
+        row = torch.cat(self._rows)
+        steps = TensorDict.cat([whole.reshape(-1), *self._partial])
+        order = row.argsort(stable=True)
+        return steps[order], row[order]
+
+
+def _check_arguments(num_groups: int, group_size: int, options: dict[str, Any]) -> None:
+    if group_size < 2 or num_groups < 1:
+        raise ValueError(
+            "Collecting groups needs num_groups of at least 1 and group_size of at least 2, got "
+            f"num_groups={num_groups}, group_size={group_size}."
+        )
+    for name in options:
+        if name in _REFUSED:
+            raise TypeError(f"TrajectoryGroupCollector does not take {name}: {_REFUSED[name]}.")
+
+
+class _Worker:
+    """Makes the collector of a worker process, which hands over its batches flat."""
+
+    def __init__(self, num_workers: int, options: dict[str, Any]) -> None:
+        self.restarted = torch.zeros(num_workers, dtype=torch.int64).share_memory_()
+        self.options = options
+
+    def __call__(self, *args: Any, **kwargs: Any) -> TrajectoryGroupCollector:
+        kwargs = {key: value for key, value in kwargs.items() if key not in _REFUSED}
+        collector = TrajectoryGroupCollector(*args, **{**kwargs, **self.options})
+        collector._yield_flat = True
+        collector._restarted = self.restarted[kwargs["worker_idx"]]
+        return collector
+
+
+class _GroupsOfWorkers(MultiCollector):
+    """What the collectors with worker processes share."""
+
+    def __init__(self, *args: Any, num_groups: int, options: dict[str, Any], **kwargs: Any) -> None:
+        """Start the workers, each for groups of `num_groups`."""
+        create_env_fn = args[0]
+        num_workers = len(create_env_fn)
+        self._worker = _Worker(num_workers, {"num_groups": num_groups, **options})
+        self._pack = partial(
+            pack_groups, group_size=options["group_size"], group_key=options["group_key"]
+        )
+        total_frames = kwargs.pop("total_frames")
+        writes = kwargs.get("replay_buffer") is not None
+        # What a worker writes to a buffer it processes itself; what it hands over is packed first.
+        self._process = None if writes else kwargs.pop("postproc", None)
+        super().__init__(
+            *args,
+            frames_per_batch=num_workers,
+            collector_class=self._worker,
+            trajs_per_batch=1 if writes else None,  # has the storage made for flat steps
+            **kwargs,
+        )
+        if total_frames >= 0:  # TorchRL's own setter warns unless it is a multiple of a batch
+            self.total_frames = total_frames
+
+    @property
+    def restarted_trajectories(self) -> int:
+        """Trajectories begun and thrown away because the weights changed within a batch."""
+        return int(self._worker.restarted.sum())
+
+    def _flatten(self, steps: TensorDictBase) -> Any:
+        """Return the steps `[S]` that TorchRL's collector hands over."""
+        return steps
+
+    def _add_collector_outputs_to_fake_td(self, fake_td: TensorDictBase) -> TensorDictBase:
+        """Describe a step as the workers write it, for the storage."""
+        step = super()._add_collector_outputs_to_fake_td(fake_td)
+        out_keys = getattr(self.policy, "out_keys", ())
+        handed_on = (unravel_key(key[1:]) for key in out_keys if key[0] == "next")
+        options = self._worker.options
+        dropped = {*map(unravel_key, options["exclude_keys"]), *handed_on}
+        return step.select(*_recorded_keys(step, dropped, options["compact_obs"]))
+
+    def iterator(self) -> Iterator[TensorDictBase | None]:
+        """Yield batches, or None after each that is written to the replay buffer."""
+        buffer = self.replay_buffer
+        start = 0 if buffer is None else buffer.write_count - self._frames
+        for steps in super().iterator():  # pyright: ignore[reportAbstractUsage]
+            if buffer is not None:
+                self._frames = buffer.write_count - start
+                yield None
+                continue
+            batch = self._pack(self._flatten(steps))
+            yield batch if self._process is None else self._process(batch)
+
+
+class _SyncGroups(_GroupsOfWorkers, MultiSyncCollector):
+    """All workers' groups in one batch."""
+
+    def _flatten(self, steps: TensorDictBase) -> Any:
+        return TensorDict.cat(steps.unbind(0))  # one entry for each worker
+
+
+class _AsyncGroups(_GroupsOfWorkers, MultiAsyncCollector):
+    """One worker's groups in each batch."""
+
+
+def _make_multi_collector(
+    create_env_fn: Callable[[], EnvBase] | Sequence[Callable[[], EnvBase]],
+    policy: Any = None,
+    *,
+    num_collectors: int | None,
+    sync: bool | None,
+    num_groups: int,
+    group_size: int,
+    total_frames: int = -1,
+    compact_obs: bool = True,
+    exclude_keys: Sequence[NestedKey] = (),
+    max_steps: int = 10_000,
+    group_key: NestedKey = GROUP_KEY,
+    **kwargs: Any,
+) -> _GroupsOfWorkers:
+    _check_arguments(num_groups, group_size, kwargs)
+    if not isinstance(create_env_fn, Sequence):
+        create_env_fn = [create_env_fn] * (num_collectors or 1)
+    num_workers = len(create_env_fn)
+    if num_collectors not in (None, num_workers):
+        raise ValueError(
+            f"num_collectors={num_collectors} does not match the {num_workers} environment makers."
+        )
+    if sync and num_groups % num_workers:
+        raise ValueError(
+            f"num_groups={num_groups} must be a multiple of the number of workers, {num_workers}."
+        )
+    options = {
+        "group_size": group_size,
+        "compact_obs": compact_obs,
+        "exclude_keys": exclude_keys,
+        "max_steps": max_steps,
+        "group_key": group_key,
+    }
+    kwargs.setdefault("auto_register_policy_transforms", True)
+    return (_SyncGroups if sync else _AsyncGroups)(
+        create_env_fn,
+        policy,
+        num_groups=num_groups // num_workers if sync else num_groups,
+        options=options,
+        total_frames=total_frames,
+        **kwargs,
+    )

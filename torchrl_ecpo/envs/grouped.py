@@ -1,0 +1,175 @@
+"""Groups over any environment: copies that start from the same state."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import Unbounded
+from torchrl.data.utils import CloudpickleWrapper
+from torchrl.envs import EnvBase, GymWrapper, ParallelEnv, SerialEnv, TransformedEnv
+
+from torchrl_ecpo.data import GROUP_KEY
+from torchrl_ecpo.envs._groups import GroupIdAllocator
+
+__all__ = ["GroupedEnv"]
+
+
+class GroupedEnv(EnvBase):
+    """`G` rows of `K` copies of an environment; the copies of a row start from the same state.
+
+    The batch size is `[num_groups, group_size]`, `[G, K]`. Each row plays one problem instance
+    after the other: the `n`-th episode of each of its copies is started from the seed of (row, `n`)
+    and carries the same integer ``"group"``, whether the copies are reset together or each at its
+    own time. A reset of everything starts a new instance in every row.
+
+    Wrap it in the transforms that count or sum (``StepCounter(max_steps=...)``, ``RewardSum()``,
+    ``InitTracker()``, ``DoubleToFloat()``) like any other environment.
+
+    Args:
+        create_env_fn: makes one copy, for example ``lambda: GymEnv("CartPole-v1")``; its batch size
+            must be empty.
+        num_groups: `G`.
+        group_size: `K`, at least 2.
+        parallel: whether each copy runs in a process of its own (``ParallelEnv``) instead of one
+            after the other in this one (``SerialEnv``). Default: False.
+
+    The seeds come from the operating system until :meth:`set_seed` is called, as gymnasium's do.
+    Within a reset, torch's generators are seeded too and put back afterwards, so that environments
+    written in torch start from the same state as well and the policy's randomness is untouched.
+    The copies' transitions may be random: only the start is shared.
+
+    Raises:
+        ValueError: if `group_size` is below 2, `num_groups` below 1, or a copy has a batch size.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> env = GroupedEnv(lambda: GymEnv("CartPole-v1"), num_groups=2, group_size=3)
+        >>> start = env.reset()
+        >>> start["observation"].shape, start["group"].shape
+        (torch.Size([2, 3, 4]), torch.Size([2, 3]))
+        >>> bool((start["observation"] == start["observation"][:, :1]).all())
+        True
+        >>> start["group"].unique().numel()
+        2
+    """
+
+    copies: EnvBase
+
+    def __init__(
+        self,
+        create_env_fn: Callable[[], EnvBase],
+        *,
+        num_groups: int,
+        group_size: int,
+        parallel: bool = False,
+    ) -> None:
+        """Make the environment; the class describes the arguments."""
+        if num_groups < 1 or group_size < 2:
+            raise ValueError(
+                "A GroupedEnv needs at least 1 group of at least 2 copies, got "
+                f"num_groups={num_groups}, group_size={group_size}."
+            )
+        batched = ParallelEnv if parallel else SerialEnv
+        copies = batched(
+            num_groups * group_size, CloudpickleWrapper(partial(_make_copy, create_env_fn))
+        )
+        if copies.batch_size != (num_groups * group_size,):
+            shape = tuple(copies.batch_size[1:])
+            copies.close(raise_if_closed=False)
+            raise ValueError(
+                f"create_env_fn must make an environment of batch size (), got {shape}: its rows "
+                "cannot be started one by one. num_groups and group_size make the batch."
+            )
+        super().__init__(batch_size=torch.Size([num_groups, group_size]), device=copies.device)
+        # Not a submodule: the state of the copies is not the state_dict's business.
+        object.__setattr__(self, "copies", copies)
+        self._copy_specs()
+        self._ids = GroupIdAllocator()
+        self._group = torch.zeros(self.batch_size, dtype=torch.int64, device=self.device)
+        self._set_seed(None)
+
+    def _copy_specs(self) -> None:
+        rows = self.batch_size
+        for name in ("observation", "action", "state", "reward", "done"):
+            spec = getattr(self.copies, f"full_{name}_spec").unflatten(0, rows)
+            if name == "observation":
+                spec[GROUP_KEY] = Unbounded(shape=rows, dtype=torch.int64, device=self.device)
+            setattr(self, f"full_{name}_spec", spec)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._seed = secrets.randbits(63) if seed is None else seed
+        self._episode = np.zeros(self.batch_size, dtype=int)  # of each copy, the next one
+        # (row, episode) -> seed and group id, until the last copy of the row has started it.
+        self._instances: dict[tuple[int, int], tuple[int, int]] = {}
+
+    def _next_instance(self, row: int, copy: int) -> tuple[int, int]:
+        episode = int(self._episode[row, copy])
+        self._episode[row, copy] += 1
+        key = row, episode
+        if key not in self._instances:
+            seed = np.random.SeedSequence(self._seed, spawn_key=key).generate_state(1)[0]
+            self._instances[key] = int(seed), int(self._ids.allocate(1))
+        if self._episode[row].min() > episode:
+            return self._instances.pop(key)
+        return self._instances[key]
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
+            # The copies of a row may have played different numbers of episodes.
+            self._episode[:] = self._episode.max(1, keepdims=True)
+            self._instances.clear()
+            selected = torch.ones(self.batch_size, dtype=torch.bool)
+        else:
+            selected = mask.reshape(*self.batch_size, -1).any(-1).cpu()
+        options = [dict(kwargs) for _ in range(selected.numel())]
+        group = self._group.clone()
+        for row, copy in selected.nonzero().tolist():
+            seed, group[row, copy] = self._next_instance(row, copy)
+            options[row * self.batch_size[1] + copy]["seed"] = seed
+        self._group = group
+        flat = None if tensordict is None or mask is None else tensordict.reshape(-1)
+        out = self.copies._reset(flat, list_of_kwargs=options)  # pyright: ignore[reportArgumentType]
+        return out.reshape(self.batch_size).set(GROUP_KEY, group.clone())
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        out = self.copies._step(tensordict.reshape(-1))
+        return out.reshape(self.batch_size).set(GROUP_KEY, self._group.clone())
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Close the copies."""
+        super().close(raise_if_closed=raise_if_closed)
+        if not self.copies.is_closed:
+            self.copies.close(raise_if_closed=raise_if_closed)
+
+
+def _make_copy(create_env_fn: Callable[[], EnvBase]) -> EnvBase:
+    return _SeededEnv(create_env_fn(), auto_unwrap=False)
+
+
+class _SeededEnv(TransformedEnv):
+    """An environment whose reset takes the seed that it starts from."""
+
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, seed: int | None = None, **kwargs: Any
+    ) -> TensorDictBase:
+        if seed is None:
+            return super()._reset(tensordict, **kwargs)
+        native = self.base_env
+        while isinstance(native, TransformedEnv):
+            native = native.base_env
+        cuda = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
+        with torch.random.fork_rng(devices=cuda):
+            torch.manual_seed(seed)
+            if isinstance(native, GymWrapper):
+                # Gymnasium seeds and resets in one call; set_seed would be a second reset.
+                kwargs["seed"] = seed
+            else:
+                self.base_env.set_seed(seed, static_seed=True)
+            return super()._reset(tensordict, **kwargs)

@@ -1,0 +1,282 @@
+"""A recurrent core that computes each distinct history once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from math import prod
+from typing import Any, cast
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import TensorDictPrimer
+from torchrl.modules import recurrent_mode
+
+from torchrl_ecpo.modules.histories import LSTMOverHistories, distinct_histories, hash_states
+
+__all__ = ["DistinctHistoryLSTM"]
+
+
+class DistinctHistoryLSTM(TensorDictModuleBase):
+    """An LSTM over categorical inputs that computes each distinct history once.
+
+    It takes the place of :class:`torchrl.modules.LSTMModule` on one-hot inputs, with the same
+    numbers. Rollouts of one problem instance begin alike, so at each step many rows of a batch have
+    seen the same inputs since their start; their LSTM states are equal. The rows are de-duplicated,
+    the cell and the readout run on the distinct ones alone, and the result is gathered back: in
+    sampling, one step at a time, and in recurrent mode
+    (:class:`torchrl.modules.set_recurrent_mode`) over whole sequences `[*B, T]`.
+
+    - Rows with `is_init` start from the zero state, also in the middle of a sequence.
+    - Sampling: the state of each row travels in the tensordict, as with `LSTMModule`, and rows are
+      compared by the state's bits. So nothing is remembered between calls: rows may be dropped,
+      reordered or moved to another process, and weights may change. Rows whose root `done` is set
+      have ended: they share one zero state.
+    - Recurrent mode: padded steps, by `("collector", "mask")` where it is there, cost nothing and
+      give zeros. Gradients are exact (once: no second derivatives); where equal states are given
+      to begin with, one of them gets the gradient of all. No states are written: the update needs
+      none.
+
+    Args:
+        num_classes: the number of classes of each input, in the order of the input keys and of
+            their last dimensions.
+        hidden_size: H. Default 128 (the UREX paper's).
+        readout: a module that is applied to each distinct output `[n, H]`, for example a linear
+            layer to logits. Default None: the output is the LSTM's.
+        in_keys: the integer inputs, each `[*B]` or `[*B, d]`.
+        out_key: the output. Default "embed".
+        state_key: the states' keys are this with "_h" and "_c" appended, each `[*B, 1, H]`. Default
+            "recurrent_state", as with `LSTMModule`.
+        store_states: whether the states stay in collected data, where they are needed only for
+            sequences that begin in the middle of a trajectory. Default False: they would take most
+            of a rollout's memory.
+        device: of the parameters.
+        dtype: of the parameters.
+
+    Attributes:
+        cell: the `torch.nn.LSTMCell` that holds the parameters, initialised by PyTorch: uniform in
+            +-1/sqrt(H).
+
+    Raises:
+        KeyError: if `is_init` is missing, or the state of a row that continues.
+        ValueError: if an input is out of range, or there is no time dimension in recurrent mode.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules import set_recurrent_mode
+        >>> from torchrl_ecpo.modules import DistinctHistoryLSTM
+        >>> lstm = DistinctHistoryLSTM([4, 3], 8, in_keys=["observation", "previous_action"])
+        >>> data = TensorDict(
+        ...     observation=torch.randint(4, (6, 10)),
+        ...     previous_action=torch.randint(3, (6, 10)),
+        ...     is_init=(torch.arange(10) == 0).expand(6, 10).unsqueeze(-1),
+        ...     batch_size=[6, 10],
+        ... )
+        >>> with set_recurrent_mode(True):
+        ...     lstm(data)["embed"].shape
+        torch.Size([6, 10, 8])
+    """
+
+    def __init__(
+        self,
+        num_classes: Sequence[int],
+        hidden_size: int = 128,
+        readout: nn.Module | None = None,
+        *,
+        in_keys: Sequence[NestedKey],
+        out_key: str = "embed",
+        state_key: str = "recurrent_state",
+        store_states: bool = False,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        super().__init__()
+        self.num_classes = tuple(num_classes)
+        self.num_symbols = prod(num_classes)
+        if min(num_classes) < 1 or self.num_symbols > 2**31:
+            raise ValueError(
+                "num_classes: expected positive numbers with a product of at most 2^31, got "
+                f"{self.num_classes}."
+            )
+        states = (f"{state_key}_h", f"{state_key}_c")
+        self.input_keys = list(in_keys)
+        all_keys: list[Any] = [*in_keys, *states, "is_init"]
+        self.in_keys = all_keys
+        out_keys: list[Any] = [out_key, *(("next", key) for key in states)]
+        self.out_keys = out_keys
+        self.state_keys, self.store_states = states, store_states
+        self.cell = nn.LSTMCell(sum(num_classes), hidden_size, device=device, dtype=dtype)
+        self.readout = readout if readout is not None else nn.Identity()
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """The transform that lets an environment carry the states from step to step.
+
+        Returns:
+            A :class:`torchrl.envs.TensorDictPrimer`; collectors append it by themselves.
+        """
+        primer = TensorDictPrimer if self.store_states else _TransientPrimer
+        spec = Unbounded(torch.Size((1, self.cell.hidden_size)), dtype=self.cell.weight_hh.dtype)
+        return primer(dict.fromkeys(self.state_keys, spec), expand_specs=True)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the output; in sampling also the next states.
+
+        Args:
+            tensordict: `[*B]`, or `[*B, T]` in recurrent mode.
+
+        Returns:
+            The same tensordict.
+        """
+        is_init = tensordict.get("is_init", None)
+        if is_init is None:
+            raise KeyError(
+                "is_init: expected the key that marks a trajectory's first step, found none among "
+                f"{sorted(map(str, tensordict.keys()))}; append torchrl.envs.InitTracker() to the "
+                "environment."
+            )
+        shape = tensordict.shape
+        symbols, starts = self._symbols(tensordict), is_init.reshape(shape)
+        if recurrent_mode():
+            if not shape:
+                raise ValueError(
+                    "tensordict: expected a batch shape [*B, T], time last, in recurrent mode, got "
+                    "none."
+                )
+            mask = tensordict.get(("collector", "mask"), None)
+            starts = starts if mask is None else starts | ~mask
+            symbols, starts, mask = (_time_first(x) for x in (symbols, starts, mask))
+            nodes, output, *_ = self._run(symbols, starts, mask, self._states(tensordict, starts))
+            return tensordict.set(self.out_keys[0], _rows(output, nodes.t(), shape))
+
+        ended = tensordict.get("done", None)
+        if ended is not None:
+            ended = ended.reshape(shape)
+            starts, symbols = starts | ended, symbols.masked_fill(ended, 0)
+        symbols, starts = symbols.reshape(1, -1), starts.reshape(1, -1)
+        nodes, output, h, c = self._run(symbols, starts, None, self._states(tensordict, starts))
+        tensordict.set(self.out_keys[0], _rows(output, nodes, shape))
+        for key, state in zip(self.out_keys[1:], (h, c), strict=True):
+            tensordict.set(key, _rows(state, nodes, (*shape, 1)))
+        return tensordict
+
+    def _run(
+        self,
+        symbols: Tensor,
+        starts: Tensor,
+        mask: Tensor | None,
+        states: tuple[Tensor, Tensor] | None,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Of sequences `[T, N]`, the node at each place; each node's output, h and c `[n, *]`."""
+        histories = distinct_histories(
+            symbols,
+            starts,
+            mask,
+            num_symbols=self.num_symbols,
+            first_hashes=None if states is None else hash_states(*states),
+        )
+        present, node_symbols = symbols.flatten()[histories.rows].unique(return_inverse=True)
+        lstm = LSTMOverHistories
+        h, c, _ = (lstm.apply if torch.is_grad_enabled() else lstm.forward)(
+            self._project(present),
+            self.cell.weight_hh,
+            *((None, None) if states is None else states),
+            node_symbols,
+            histories,
+        )
+        output = self.readout(h)
+        nodes = histories.nodes
+        if mask is not None:
+            # Node -1, the padding, is the last row.
+            output = torch.cat([output, output.new_zeros(1, output.shape[-1])])
+            nodes = nodes.masked_fill(nodes < 0, len(output) - 1)
+        return nodes, output, h, c
+
+    def _symbols(self, tensordict: TensorDictBase) -> Tensor:
+        """The input tuple as one number, int64 `[*B]`."""
+        inputs = [tensordict.get(key) for key in self.input_keys]
+        ndim = tensordict.ndim
+        classes = torch.cat([x if x.ndim > ndim else x.unsqueeze(-1) for x in inputs], -1)
+        if classes.shape[-1] != len(self.num_classes):
+            raise ValueError(
+                f"{self.input_keys}: expected {len(self.num_classes)} integers in all, one for "
+                f"each of num_classes, got {classes.shape[-1]}."
+            )
+        sizes, weights, _ = _radix(self.num_classes, classes.device)
+        if ((classes < 0) | (classes >= sizes)).any():
+            flat = classes.reshape(-1, len(self.num_classes))
+            raise ValueError(
+                f"{self.input_keys}: expected classes in [0, n) for n in {self.num_classes}, got "
+                f"values from {flat.amin(0).tolist()} to {flat.amax(0).tolist()}."
+            )
+        return (classes * weights).sum(-1)
+
+    def _project(self, symbols: Tensor) -> Tensor:
+        """The input's part of the gates, `[S, 4H]`: a one-hot product is a sum of columns."""
+        sizes, weights, offsets = _radix(self.num_classes, symbols.device)
+        hot = symbols.unsqueeze(-1) // weights % sizes + offsets
+        columns = F.embedding_bag(hot, self.cell.weight_ih.t().contiguous(), mode="sum")
+        return columns + (self.cell.bias_ih + self.cell.bias_hh)
+
+    def _states(self, tensordict: TensorDictBase, starts: Tensor) -> tuple[Tensor, Tensor] | None:
+        """The states `[N, H]` that rows continue from; None where all start."""
+        if starts[0].all():
+            return None
+        if recurrent_mode() and not self.store_states:
+            raise ValueError(
+                "is_init: expected every sequence to begin with a trajectory's first step, since "
+                "states are not stored, and some do not; keep trajectories whole, or make the "
+                "policy with store_states=True."
+            )
+        h, c = (tensordict.get(key, None) for key in self.state_keys)
+        if h is None or c is None:
+            raise KeyError(
+                f"{self.state_keys}: expected the states of rows that continue a trajectory, found "
+                "none; append this module's make_tensordict_primer() to the environment."
+            )
+        # [*B, 1, H]; of a sequence, the first.
+        if recurrent_mode():
+            h, c = h[..., 0, :, :], c[..., 0, :, :]
+        return h.reshape(-1, h.shape[-1]), c.reshape(-1, c.shape[-1])
+
+
+class _TransientPrimer(TensorDictPrimer):
+    """A primer whose entries go from step to step, and not into the collected data."""
+
+    def _post_step_mdp_hooks(
+        self, tensordict: TensorDictBase, tensordict_: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        self._drop(tensordict)
+        return tensordict, tensordict_
+
+    def transform_fake_tensordict(self, fake_tensordict: TensorDictBase) -> TensorDictBase:
+        return self._drop(fake_tensordict)
+
+    def _drop(self, tensordict: TensorDictBase) -> TensorDictBase:
+        for key in cast(Composite, self.primers).keys(True, True):
+            tensordict.pop(key, None)
+            tensordict.pop(("next", key), None)
+        return tensordict
+
+
+@lru_cache(maxsize=64)
+def _radix(num_classes: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Bases and weights of input tuples as numbers; where each digit's one-hot vector starts."""
+    sizes = torch.tensor(num_classes, device=device)
+    weights = sizes.flip(0).cumprod(0).flip(0) // sizes
+    return sizes, weights, sizes.cumsum(0) - sizes
+
+
+def _time_first(x: Tensor | None) -> Any:
+    """`[*B, T]` to `[T, N]`."""
+    return None if x is None else x.reshape(-1, x.shape[-1]).t().contiguous()
+
+
+def _rows(values: Tensor, index: Tensor, shape: Sequence[int]) -> Tensor:
+    """`values[index]` along the first dimension, `[*shape, *]`."""
+    # Quicker than indexing, above all backwards.
+    return values.index_select(0, index.reshape(-1)).reshape(*shape, -1)

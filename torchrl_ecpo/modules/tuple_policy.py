@@ -1,0 +1,348 @@
+"""Policies whose action is the tuple (move, write, character)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import torch
+from tensordict import NestedKey
+from tensordict.nn import (
+    TensorDictModule,
+    TensorDictSequential,
+)
+from torch import Tensor, nn
+from torch.distributions import Distribution, constraints
+from torch.distributions.utils import lazy_property
+from torch.nn import functional as F
+from torchrl.envs import ExplorationType
+from torchrl.modules import LSTMModule, ProbabilisticActor
+
+from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
+
+__all__ = ["TupleCategorical", "make_tuple_policy"]
+
+Head = Literal["masked", "unmasked", "joint"]
+
+
+class TupleCategorical(Distribution):
+    """Distribution of the action tuple (move, write, character).
+
+    Three heads. With the first and the last the character is 0 where nothing is written (write =
+    0), and has no log-probability there.
+
+    - `"masked"`: log p(move) + log p(write) + [write = 1] log p(character). The environment ignores
+      the character where nothing is written; without the mask an entropy term would reward its
+      noise.
+    - `"unmasked"`: three independent factors.
+    - `"joint"`: one softmax over move and (nothing, or a character to write), so over
+      `nvec[0] * (1 + nvec[2])` classes, in that order; it can express any distribution of what the
+      environment tells apart.
+
+    `B` is any batch shape. Logits of any finite size give finite entropies and no NaN.
+
+    Args:
+        logits: `[*B, L]`, unnormalised; L = sum(nvec), or nvec[0] * (1 + nvec[2]) for the joint
+            head.
+        nvec: the number of moves, of write flags (2) and of characters.
+        head: see above. Default `"masked"`: without the mask our runs on Reverse and
+            ReversedAddition failed.
+        validate_args: whether NaN logits and actions out of range are refused. Default True; False
+            saves the checks, and on a GPU their synchronisation.
+
+    Raises:
+        ValueError: if the head is unknown, nvec is not of the form (moves, 2, characters), L is
+            another size, or a logit is NaN.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_ecpo.modules import TupleCategorical
+        >>> dist = TupleCategorical(torch.zeros(4, 9), nvec=(2, 2, 5))
+        >>> action = dist.sample()
+        >>> action.shape, dist.log_prob(action).shape
+        (torch.Size([4, 3]), torch.Size([4]))
+        >>> dist.log_prob(torch.tensor([1, 0, 0])).exp()[0].item()
+        0.25
+    """
+
+    has_rsample = False
+
+    def __init__(
+        self,
+        logits: Tensor,
+        nvec: Sequence[int],
+        head: Head = "masked",
+        validate_args: bool = True,
+    ) -> None:
+        size = self.num_logits(nvec, head)
+        if logits.shape[-1:] != (size,):
+            raise ValueError(
+                f"logits: expected a last dimension of {size} for head={head!r} and "
+                f"nvec={tuple(nvec)}, got shape {tuple(logits.shape)}."
+            )
+        self.nvec, self.head, self.logits = tuple(nvec), head, logits
+        super().__init__(logits.shape[:-1], torch.Size([3]), validate_args=validate_args)
+
+    @staticmethod
+    def num_logits(nvec: Sequence[int], head: Head = "masked") -> int:
+        """The number of logits that a head needs.
+
+        Args:
+            nvec: the number of moves, of write flags (2) and of characters.
+            head: one of "masked", "unmasked" and "joint".
+
+        Returns:
+            The size of the last dimension of `logits`.
+
+        Raises:
+            ValueError: if the head is unknown or nvec is not of the form (moves, 2, characters).
+        """
+        if head not in ("masked", "unmasked", "joint"):
+            raise ValueError(f"head: expected 'masked', 'unmasked' or 'joint', got {head!r}.")
+        if len(nvec) != 3 or nvec[1] != 2 or min(nvec) < 1:
+            raise ValueError(
+                "nvec: expected (moves, 2, characters), the sizes of move, write flag and "
+                f"character, got {tuple(nvec)}."
+            )
+        return nvec[0] * (1 + nvec[2]) if head == "joint" else sum(nvec)
+
+    @property
+    def arg_constraints(self) -> dict[str, constraints.Constraint]:
+        """Logits without NaN."""
+        return {"logits": constraints.real_vector}
+
+    @property
+    def support(self) -> constraints.Constraint:
+        """Tuples of integers of at least 0; their upper bounds are nvec."""
+        return constraints.independent(constraints.nonnegative_integer, 1)
+
+    def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
+        """Draw actions by the Gumbel-max trick, in one pass over the logits.
+
+        Args:
+            sample_shape: the shape of the sample, before the batch shape.
+
+        Returns:
+            int64 `[*sample_shape, *B, 3]`.
+        """
+        logits = self.logits.detach()
+        uniform = torch.rand(
+            (*sample_shape, *logits.shape), dtype=logits.dtype, device=logits.device
+        )
+        gumbel = uniform.log_().neg_().log_().neg_()
+        return self._decode(self._factors(logits + gumbel).argmax(-1))
+
+    @property
+    def mode(self) -> Tensor:
+        """The most probable action, int64 `[*B, 3]`; exact for each head."""
+        choice = self._log_probs.argmax(-1)
+        if self.head == "masked":
+            _, write, character = self._log_probs.unbind(-2)
+            choice[..., 1] = write[..., 1] + character.amax(-1) > write[..., 0]
+        return self._decode(choice)
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The most probable action: what `ExplorationType.DETERMINISTIC` asks for."""
+        return self.mode
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-probability of actions.
+
+        Args:
+            value: int64 `[..., 3]`, broadcast against the batch shape. Where nothing is written
+                the character is read only by the unmasked head.
+
+        Returns:
+            `[...]`.
+
+        Raises:
+            ValueError: if an action is out of range.
+        """
+        if self._validate_args:
+            self._check_range(value)
+        index = self._encode(value)
+        shape = index.shape[:-1]
+        if shape != self.batch_shape:
+            shape = torch.broadcast_shapes(shape, self.batch_shape)
+        log_probs = self._log_probs.expand(*shape, *self._log_probs.shape[-2:])
+        index = index.expand(*shape, -1).unsqueeze(-1)
+        return self._sum(log_probs.gather(-1, index).squeeze(-1), value[..., 1] == 1)
+
+    def entropy(self) -> Tensor:
+        """Exact entropy of the tuple, in nats, `[*B]`."""
+        entropies = -(self._log_probs.exp() * self._log_probs).sum(-1)
+        if self.head != "masked":
+            return entropies.sum(-1)
+        move, write, character = entropies.unbind(-1)
+        return move + write + character * self._log_probs[..., 1, 1].exp()
+
+    @lazy_property
+    def _log_probs(self) -> Tensor:
+        """Normalised log-probabilities of each factor, `[*B, F, n]`."""
+        # The floor keeps 0 * log 0 at 0, for the padding and where a difference of logits
+        # overflows.
+        floor = torch.finfo(self.logits.dtype).min
+        # On few classes log_softmax takes two to four times as long.
+        factors = self._factors(self.logits)
+        return (factors - factors.logsumexp(-1, keepdim=True)).clamp(min=floor)
+
+    def _factors(self, values: Tensor) -> Tensor:
+        """Values of each logit `[..., L]`, by factor, padded with -inf: `[..., F, n]`."""
+        if self.head == "joint":
+            return values.unsqueeze(-2)
+        width = max(self.nvec)
+        padding = values.new_full((), -torch.inf)
+        pieces = []
+        for part in values.split(self.nvec, -1):
+            pieces += [part, padding.expand(*part.shape[:-1], width - part.shape[-1])]
+        return torch.cat(pieces, -1).unflatten(-1, (3, width))
+
+    def _sum(self, log_probs: Tensor, writes: Tensor) -> Tensor:
+        """The tuple's log-probability from its factors' `[..., F]`."""
+        if self.head != "masked":
+            return log_probs.sum(-1)
+        move, write, character = log_probs.unbind(-1)
+        return move + write + torch.where(writes, character, 0)
+
+    def _decode(self, choice: Tensor) -> Tensor:
+        """The action `[..., 3]` that has the class `choice` `[..., F]` of each factor."""
+        if self.head == "joint":
+            written = choice.squeeze(-1) % (1 + self.nvec[2])
+            move = choice.squeeze(-1) // (1 + self.nvec[2])
+            return torch.stack([move, (written > 0).long(), (written - 1).clamp(min=0)], -1)
+        if self.head == "masked":
+            choice[..., 2] *= choice[..., 1]
+        return choice
+
+    def _encode(self, action: Tensor) -> Tensor:
+        """The class of each factor, `[..., F]`, that an action `[..., 3]` has."""
+        if self.head != "joint":
+            return action
+        move, write, character = action.unbind(-1)
+        return (move * (1 + self.nvec[2]) + write * (1 + character)).unsqueeze(-1)
+
+    def _check_range(self, action: Tensor) -> None:
+        if action.shape[-1:] != (3,):
+            raise ValueError(
+                f"action: expected a last dimension of 3 (move, write, character), got shape "
+                f"{tuple(action.shape)}."
+            )
+        if ((action < 0) | (action >= action.new_tensor(self.nvec))).any():
+            flat = action.reshape(-1, 3)
+            raise ValueError(
+                f"action: expected (move, write, character) in [0, nvec) for nvec={self.nvec}, "
+                f"got values from {flat.amin(0).tolist()} to {flat.amax(0).tolist()}."
+            )
+
+
+def make_tuple_policy(
+    num_observations: int,
+    nvec: Sequence[int],
+    *,
+    hidden_size: int = 128,
+    head: Head = "masked",
+    distinct_histories: bool = True,
+    store_states: bool = False,
+    device: torch.device | str | None = None,
+    dtype: torch.dtype | None = None,
+) -> ProbabilisticActor:
+    """Build the recurrent policy of the algorithmic tasks.
+
+    One-hot observation and previous action, an LSTM, a linear head, :class:`TupleCategorical`. It
+    reads `observation` (int64 `[*B]`, below `num_observations`), `previous_action` (int64 `[*B,
+    3]`, below nvec + 1: the last class of each means that there is none yet) and `is_init` (of
+    `torchrl.envs.InitTracker`), and writes `logits`, `action` (int64 `[*B, 3]`) and
+    `action_log_prob` (`[*B]`). It samples unless `set_exploration_type` asks for its mode.
+
+    Args:
+        num_observations: the number of observations, the blank included.
+        nvec: the number of moves, of write flags (2) and of characters.
+        hidden_size: of the LSTM. Default 128 (the UREX paper's).
+        head: "masked", "unmasked" or "joint": see :class:`TupleCategorical`.
+        distinct_histories: whether rows with equal histories are computed once
+            (:class:`DistinctHistoryLSTM`), or each row by :class:`torchrl.modules.LSTMModule`. The
+            numbers and the order of the parameters are the same.
+        store_states: see :class:`DistinctHistoryLSTM`; `LSTMModule` always stores them.
+        device: of the parameters.
+        dtype: of the parameters.
+
+    Returns:
+        The actor. Its environment needs `InitTracker()` and, to sample, the state's primer:
+        `torchrl.modules.get_env_transforms_from_module(actor)` gives both.
+
+    Raises:
+        ValueError: if `head` or `nvec` are not as above.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules import set_recurrent_mode
+        >>> from torchrl_ecpo.modules import make_tuple_policy
+        >>> actor = make_tuple_policy(num_observations=6, nvec=(2, 2, 5), hidden_size=8)
+        >>> data = TensorDict(
+        ...     observation=torch.randint(6, (4, 10)),
+        ...     previous_action=torch.zeros(4, 10, 3, dtype=torch.int64),
+        ...     is_init=(torch.arange(10) == 0).expand(4, 10).unsqueeze(-1),
+        ...     batch_size=[4, 10],
+        ... )
+        >>> step = actor(data[:, 0])
+        >>> step["action"].shape, step["action_log_prob"].shape
+        (torch.Size([4, 3]), torch.Size([4]))
+        >>> with set_recurrent_mode(True):
+        ...     actor.get_dist(data).entropy().shape
+        torch.Size([4, 10])
+    """
+    num_logits = TupleCategorical.num_logits(nvec, head)
+    num_classes = [num_observations, *(n + 1 for n in nvec)]
+    inputs: list[NestedKey] = ["observation", "previous_action"]
+    factory: dict[str, Any] = {"device": device, "dtype": dtype}
+    core: Any
+    readout = nn.Linear(hidden_size, num_logits, **factory)
+    if distinct_histories:
+        core = DistinctHistoryLSTM(
+            num_classes,
+            hidden_size,
+            readout=readout,
+            in_keys=inputs,
+            out_key="logits",
+            store_states=store_states,
+            **factory,
+        )
+    else:
+        lstm = nn.LSTM(sum(num_classes), hidden_size, batch_first=True, **factory)
+        modules: list[Any] = [
+            TensorDictModule(_OneHot(num_classes, dtype), in_keys=inputs, out_keys=["one_hot"]),
+            LSTMModule(lstm=lstm, in_key="one_hot", out_key="embed"),
+            TensorDictModule(readout, in_keys=["embed"], out_keys=["logits"]),
+        ]
+        core = TensorDictSequential(*modules)
+    return ProbabilisticActor(
+        core,
+        in_keys=["logits"],
+        distribution_class=TupleCategorical,
+        distribution_kwargs={"nvec": tuple(nvec), "head": head},
+        default_interaction_type=ExplorationType.RANDOM,
+        return_log_prob=True,
+        log_prob_key="action_log_prob",
+    )
+
+
+class _OneHot(nn.Module):
+    """One-hot vectors of the inputs, concatenated.
+
+    Args:
+        num_classes: the number of classes of the observation and of each part of the action.
+        dtype: of the vectors. Default None: PyTorch's default.
+    """
+
+    def __init__(self, num_classes: Sequence[int], dtype: torch.dtype | None = None) -> None:
+        super().__init__()
+        self.num_classes = tuple(num_classes)
+        self.dtype = dtype or torch.get_default_dtype()
+
+    def forward(self, observation: Tensor, previous_action: Tensor) -> Tensor:
+        """Encode observations `[*B]` and actions `[*B, d]`: `[*B, sum(num_classes)]`."""
+        columns = [observation, *previous_action.unbind(-1)]
+        hots = [F.one_hot(x, n) for x, n in zip(columns, self.num_classes, strict=True)]
+        return torch.cat(hots, -1).to(self.dtype)
