@@ -1,0 +1,188 @@
+"""What ``env=`` names: an environment, the policy that acts in it, and what to measure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import (
+    NormalParamExtractor,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictSequential,
+)
+from torch import Tensor, nn
+from torch.distributions import Categorical
+from torchrl.envs import (
+    Compose,
+    DoubleToFloat,
+    EnvBase,
+    ExplorationType,
+    GymEnv,
+    InitTracker,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+    set_exploration_type,
+)
+from torchrl.modules import (
+    MLP,
+    ProbabilisticActor,
+    TanhNormal,
+    get_env_transforms_from_module,
+)
+
+from torchrl_ecpo.envs import AlgorithmicEnv, BanditEnv, GroupedEnv
+from torchrl_ecpo.modules import SharedCategorical, make_softmax_policy, make_tuple_policy
+
+EVALUATION_EPISODES = 100
+Metrics = dict[str, float | Tensor]
+
+
+@dataclass
+class Task:
+    """What is to be solved, by which policy, and what is measured."""
+
+    env: EnvBase
+    """Of batch size ``[num_groups, group_size]``."""
+    actor: ProbabilisticTensorDictSequential
+    measure: Callable[[TensorDictBase], Metrics]
+    """What a batch of groups ``[num_groups, group_size, T]`` tells beside the loss."""
+    evaluate: Callable[[TensorDictBase], Metrics]
+    """Measures the actor as it stands; the last batch says how difficult a problem should be."""
+    shown: Sequence[str]
+    """Metrics on the progress bar and in the picture."""
+
+
+def make_task(config: DictConfig) -> Task:
+    """Build the task that ``env=`` names."""
+    makers = {"algorithmic": make_algorithmic, "bandit": make_bandit, "gym": make_gym}
+    return makers[config.env.kind](config)
+
+
+def make_bandit(config: DictConfig) -> Task:
+    """The synthetic bandit; its one-layer policy is known exactly, so nothing need be sampled."""
+    env = BanditEnv(
+        num_actions=config.env.num_actions,
+        num_features=config.env.num_features,
+        exponent=config.env.exponent,
+        instance_seed=config.env.instance_seed,
+        num_groups=config.num_groups,
+        group_size=config.group_size,
+    )
+    actor = make_softmax_policy(env.features)
+    state = TensorDict({"observation": torch.ones(1)})
+
+    @torch.no_grad()
+    def measure(groups: TensorDictBase) -> Metrics:
+        distribution = actor.get_dist(state.clone())
+        assert isinstance(distribution, SharedCategorical)
+        return {"expected_reward": env.expected_reward(distribution.probs)}
+
+    return Task(env, actor, measure, lambda groups: {}, ("expected_reward", "entropy", "ESS"))
+
+
+def make_algorithmic(config: DictConfig) -> Task:
+    """A task of gym's algorithmic suite, with the recurrent tuple policy."""
+    make_env = partial(AlgorithmicEnv, config.env.name)
+    env = make_env(
+        num_groups=config.num_groups,
+        group_size=config.group_size,
+        curriculum=config.env.curriculum,
+    )
+    action_spec: Any = env.action_spec
+    actor = make_tuple_policy(
+        num_observations=env.task.base + 1,
+        nvec=action_spec.nvec[0, 0].tolist(),
+        hidden_size=config.env.hidden_size,
+        head=config.env.head,
+        distinct_histories=config.env.distinct_histories,
+    )
+    other = make_env(num_groups=EVALUATION_EPISODES, curriculum=None)
+    evaluation_env = TransformedEnv(other, get_env_transforms_from_module(actor))
+    other.set_seed(config.seed + 1_000_000)
+
+    def measure(groups: TensorDictBase) -> Metrics:
+        return {
+            "level": groups["level"][..., 0].float().mean(),
+            "attained": _returns(groups).sum() / groups["attainable"][..., 0].sum(),
+            "length": groups["collector", "mask"].sum(-1).float().mean(),
+        }
+
+    def evaluate(groups: TensorDictBase) -> Metrics:
+        other.curriculum.levels.fill_(round(groups["level"][..., 0].float().mean().item()))
+        episodes = _greedy(evaluation_env, actor)
+        return {
+            "greedy_return": _returns(episodes).mean(),
+            "greedy_attained": _returns(episodes).sum() / episodes["attainable"][..., 0].sum(),
+        }
+
+    env = TransformedEnv(env, InitTracker())
+    return Task(env, actor, measure, evaluate, ("return", "level", "attained", "entropy", "ESS"))
+
+
+def make_gym(config: DictConfig) -> Task:
+    """A gymnasium task with discrete or continuous actions, with a feed-forward policy."""
+
+    def make_copy() -> EnvBase:
+        return GymEnv(config.env.name, categorical_action_encoding=True)
+
+    def limited(env: EnvBase) -> EnvBase:
+        transforms: list[Any] = [DoubleToFloat(), StepCounter(config.env.max_steps)]
+        return TransformedEnv(env, Compose(*transforms))
+
+    groups = GroupedEnv(make_copy, num_groups=config.num_groups, group_size=config.group_size)
+    env, evaluation_env = limited(groups), limited(SerialEnv(10, make_copy))
+    evaluation_env.set_seed(config.seed + 1_000_000)
+    actor = make_mlp_policy(env, config.env.hidden_sizes)
+
+    def measure(groups: TensorDictBase) -> Metrics:
+        return {"length": groups["collector", "mask"].sum(-1).float().mean()}
+
+    def evaluate(groups: TensorDictBase) -> Metrics:
+        return {"greedy_return": _returns(_greedy(evaluation_env, actor)).mean()}
+
+    return Task(env, actor, measure, evaluate, ("return", "greedy_return", "entropy", "ESS"))
+
+
+def make_mlp_policy(env: EnvBase, hidden_sizes: Sequence[int]) -> ProbabilisticTensorDictSequential:
+    """A multi-layer perceptron with a categorical or a tanh-Gaussian head, as the actions ask."""
+    spec: Any = env.action_spec
+    size = env.observation_spec["observation"].shape[-1]
+    mlp = partial(MLP, in_features=size, num_cells=list(hidden_sizes), activation_class=nn.Tanh)
+    if spec.dtype == torch.int64:
+        network = TensorDictModule(mlp(out_features=spec.space.n), ["observation"], ["logits"])
+        return ProbabilisticActor(
+            network, in_keys=["logits"], distribution_class=Categorical, return_log_prob=True
+        )
+    parts: list[Any] = [
+        TensorDictModule(mlp(out_features=2 * spec.shape[-1]), ["observation"], ["parameters"]),
+        TensorDictModule(NormalParamExtractor(), ["parameters"], ["loc", "scale"]),
+    ]
+    one = (0,) * env.ndim
+    return ProbabilisticActor(
+        TensorDictSequential(*parts),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": spec.space.low[one], "high": spec.space.high[one]},
+        return_log_prob=True,
+    )
+
+
+@torch.no_grad()
+def _greedy(env: EnvBase, actor: ProbabilisticTensorDictSequential) -> TensorDictBase:
+    """One whole episode in each row, with the most probable actions."""
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        return env.rollout(10_000, actor, break_when_any_done=False, break_when_all_done=True)
+
+
+def _returns(episodes: TensorDictBase) -> Tensor:
+    """Return of each episode; after its end an episode repeats its last step, which is left out."""
+    done = episodes["next", "done"].squeeze(-1)
+    before_end = done.cumsum(-1) - done.long() == 0
+    return (episodes["next", "reward"].squeeze(-1) * before_end).sum(-1)

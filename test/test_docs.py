@@ -1,0 +1,129 @@
+"""The documentation is true: its code runs, its links lead somewhere, its options exist."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from functools import lru_cache
+from itertools import product
+from pathlib import Path
+from textwrap import dedent
+
+import pytest
+import yaml
+from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
+
+ROOT = Path(__file__).parents[1]
+PAGES = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md"]
+ALGORITHM_PAGES = [page for page in PAGES if page.parent.name == "algorithms"]
+CONFIG = ROOT / "sota-implementations/ecpo/config"
+ALGORITHMIC_TASKS = ("copy", "duplicated_input", "repeat_copy", "reverse", "reversed_addition")
+
+FENCED = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
+COMMAND = re.compile(r"python (sota-implementations/\S+\.py)([^\n`]*)")
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
+# | `option` | `value` | ..., in a table whose second column is headed "algorithmic tasks"
+DEFAULTS_TABLE = re.compile(r"^\| option \| algorithmic tasks \|.*\n\|[-| ]+\n((?:\|.*\n)+)", re.M)
+DEFAULT = re.compile(r"^\| `([\w.]+)` \| `(.+?)` \|", re.MULTILINE)
+
+
+def name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def prose(page: Path) -> str:
+    """The text without code, in which brackets mean something else."""
+    return re.sub(r"`[^`\n]+`", "", FENCED.sub("", page.read_text()))
+
+
+def python_blocks(page: Path) -> list[str]:
+    blocks = FENCED.findall(page.read_text())
+    return [dedent(block) for _, language, block in blocks if language == "python"]
+
+
+def links(page: Path) -> list[str]:
+    return [link for link in LINK.findall(prose(page)) if "://" not in link]
+
+
+def anchors(page: Path) -> set[str]:
+    """What follows # in links to the headings of a page, as GitHub and MyST make it."""
+    headings = HEADING.findall(FENCED.sub("", page.read_text()))
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def commands(page: Path) -> list[tuple[Path, str]]:
+    """Each script that a page starts, with its options."""
+    one_line_each = page.read_text().replace("\\\n", " ")
+    return [(ROOT / script, options) for script, options in COMMAND.findall(one_line_each)]
+
+
+@lru_cache
+def composed(config_directory: Path, overrides: tuple[str, ...]) -> DictConfig:
+    with initialize_config_dir(str(config_directory), version_base="1.3"):
+        return compose("config", list(overrides))
+
+
+def compose_command(script: Path, options: str) -> None:
+    """Compose every run that a command line starts: several, if it is a sweep."""
+    words = shlex.split(options, comments=True)
+    overrides = [word for word in words if not word.startswith("-")]
+    parsed = OverridesParser.create().parse_overrides(overrides)
+    choices = [
+        [f"{override.key_or_group}={value}" for value in override.sweep_string_iterator()]
+        if override.is_sweep_override()
+        else [str(override.input_line)]
+        for override in parsed
+    ]
+    for run in product(*choices):
+        config = composed(script.parent / "config", run)
+        OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if python_blocks(page)], ids=name)
+def test_examples_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    namespace: dict[str, object] = {"__name__": "__main__"}
+    for number, block in enumerate(python_blocks(page), start=1):
+        exec(compile(block, f"{name(page)}, python block {number}", "exec"), namespace)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if links(page)], ids=name)
+def test_links_lead_somewhere(page):
+    broken = []
+    for link in links(page):
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        if not target.exists() or (anchor and anchor not in anchors(target)):
+            broken.append(link)
+    assert not broken
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=name)
+def test_commands_compose(page):
+    for script, options in commands(page):
+        assert script.is_file(), f"{name(page)} starts {script}, which does not exist"
+        compose_command(script, options)
+
+
+@pytest.mark.parametrize("page", ALGORITHM_PAGES, ids=name)
+def test_stated_defaults_are_those_of_the_configuration(page):
+    """On all five algorithmic tasks, with the loss that the page is named after."""
+    loss = "ecpo" if page.stem == "index" else page.stem
+    rows = DEFAULT.findall("".join(DEFAULTS_TABLE.findall(page.read_text())))
+    assert rows, "there is no table of defaults"
+    for option, stated in rows:
+        for task in ALGORITHMIC_TASKS:
+            config = composed(CONFIG, (f"env={task}", f"loss={loss}"))
+            value = OmegaConf.select(config, option, throw_on_resolution_failure=True)
+            value = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
+            assert value == yaml.safe_load(stated), f"{option} with env={task}"
+
+
+def test_a_wrong_option_is_noticed():
+    script = ROOT / "sota-implementations/ecpo/ecpo.py"
+    compose_command(script, " --multirun loss=ecpo,ment seed='range(0,2)' # a comment")
+    with pytest.raises(Exception, match="no_such_option"):
+        compose_command(script, "env=copy loss.no_such_option=1")
