@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,8 +12,10 @@ from matplotlib.figure import Figure
 
 __all__ = ["plot_comparison", "plot_learning_curve", "smooth"]
 
-# Okabe and Ito's palette, told apart by colour-blind readers too.
-COLOURS = ("#0072B2", "#009E73", "#D55E00", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+# Okabe and Ito's palette, told apart by colour-blind readers too. A method of the paper's Figure 1
+# has its colour there in every picture.
+METHOD_COLOURS = {"ecpo": "#0072B2", "urex": "#009E73", "ment": "#D55E00"}
+COLOURS = ("#CC79A7", "#E69F00", "#56B4E9", "#000000", *METHOD_COLOURS.values())
 
 
 def smooth(values: np.ndarray, fraction: float = 0.02) -> np.ndarray:
@@ -48,8 +51,8 @@ def plot_learning_curve(
     for panel, metric in zip(panels, present, strict=False):
         measured = [(row["step"], row[metric]) for row in rows if metric in row]
         steps, values = np.array(measured, dtype=float).T
-        panel.plot(steps, values, color=COLOURS[0], alpha=0.25, linewidth=1)
-        panel.plot(steps, smooth(values), color=COLOURS[0])
+        panel.plot(steps, values, color=METHOD_COLOURS["ecpo"], alpha=0.25, linewidth=1)
+        panel.plot(steps, smooth(values), color=METHOD_COLOURS["ecpo"])
         panel.set_ylabel(metric)
         _decorate(panel, x_label)
     figure.suptitle(title)
@@ -76,7 +79,9 @@ def plot_comparison(
     """
     figure = Figure(figsize=(6.4, 4.0), layout="constrained")
     panel = figure.subplots()
-    for colour, (method, (steps, values)) in zip(COLOURS, curves.items(), strict=False):
+    others = itertools.cycle(COLOURS)
+    for method, (steps, values) in curves.items():
+        colour = METHOD_COLOURS.get(method) or next(others)
         runs = len(values)
         mean = np.nanmean(values, axis=0)
         panel.plot(steps, mean, color=colour, label=f"{method} ({runs} runs)")
