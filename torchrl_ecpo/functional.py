@@ -154,7 +154,9 @@ def self_normalised_weights(
     """
     if mask is None:
         return log_weights.softmax(sample_dim)
-    return log_weights.where(mask, _lowest(log_weights)).softmax(sample_dim).where(mask, 0.0)
+    weights = log_weights.where(mask, _lowest(log_weights)).softmax(sample_dim).where(mask, 0.0)
+    # A real sample may itself have the lowest log-weight there is, and have shared with the masked.
+    return weights / weights.sum(sample_dim, keepdim=True).clamp_min(_tiny(weights))
 
 
 def effective_sample_size(weights: Tensor, *, sample_dim: int = -1) -> Tensor:
@@ -278,9 +280,10 @@ def mode_seeking_projection(
         >>> loss.backward(); v, log_prob.grad
         (tensor([0.5000, 0.5000]), tensor([-0.2500,  0.2500]))
     """
+    reference_log_prob, log_weights = reference_log_prob.detach(), log_weights.detach()
     if behaviour_log_prob is None:
         behaviour_log_prob = reference_log_prob
-    current = log_prob.detach()
+    current, behaviour_log_prob = log_prob.detach(), behaviour_log_prob.detach()
     ratios = self_normalised_weights(current - behaviour_log_prob, sample_dim=sample_dim, mask=mask)
     advantage = _representable(log_weights - (current - reference_log_prob))
     advantage = advantage - _weighted_sum(ratios, advantage, sample_dim, mask, keepdim=True)
@@ -328,7 +331,7 @@ def urex_surrogate(
         (tensor([0.7500, 0.2500]), tensor([-1.,  1.]))
     """
     check_temperatures(tau=tau)
-    current = log_prob.detach()
+    current, score = log_prob.detach(), score.detach()
     log_weights = lifted_log_weights(score, current, tau=0.0, tau_prime=tau)
     weights = self_normalised_weights(log_weights, sample_dim=sample_dim, mask=mask)
     uniform = _uniform_weights(score, sample_dim, mask)
@@ -569,10 +572,10 @@ def theorem1_temperatures(horizon: float, num_trajectories: int) -> tuple[float,
         >>> round(tau, 4), round(tau_prime, 4)
         (4.594, 0.0659)
     """
-    if not horizon >= 1:
-        raise ValueError(f"horizon must be at least 1, got {horizon}.")
-    if not num_trajectories >= 2:
-        raise ValueError(f"num_trajectories must be at least 2, got {num_trajectories}.")
+    if not 1 <= horizon < math.inf:
+        raise ValueError(f"horizon must be at least 1 and finite, got {horizon}.")
+    if not 2 <= num_trajectories < math.inf:
+        raise ValueError(f"num_trajectories must be at least 2 and finite, got {num_trajectories}.")
     log_n = math.log(num_trajectories)
     tau_prime = 1 / math.sqrt(horizon * log_n)
     return max(math.sqrt(horizon / (2 * log_n)) - tau_prime, 0.0), tau_prime
@@ -585,7 +588,7 @@ def _policy_gradient(
     log_prob: Tensor, signal: Tensor, uniform: Tensor, sample_dim: int, mask: Tensor | None
 ) -> Tensor:
     """Score-function surrogate of ``signal``, centred by its mean over the group."""
-    signal = signal.detach()
+    signal = _representable(signal.detach())
     centred = signal - _weighted_sum(uniform, signal, sample_dim, mask, keepdim=True)
     return -_weighted_sum(uniform * centred, log_prob, sample_dim, mask)
 
@@ -594,10 +597,11 @@ def _weighted_sum(
     weights: Tensor, values: Tensor, dim: int, mask: Tensor | None, *, keepdim: bool = False
 ) -> Tensor:
     """Sum of weights times values over real samples, whatever stands in the masked ones."""
-    products = (
-        weights * values if mask is None else (weights * values.where(mask, 0.0)).where(mask, 0.0)
-    )
-    return products.sum(dim, keepdim=keepdim)
+    if mask is not None:
+        weights, values = weights.where(mask, 0.0), values.where(mask, 0.0)
+    # The constant is clipped, not the product, so that an overflow leaves a gradient.
+    limit = torch.finfo(values.dtype).max / values.shape[dim] / values.detach().abs().clamp_min(1.0)
+    return (weights.clamp(-limit, limit) * values).sum(dim, keepdim=keepdim)
 
 
 def _uniform_weights(like: Tensor, dim: int, mask: Tensor | None) -> Tensor:
@@ -612,8 +616,8 @@ def _masked_logsumexp(values: Tensor, dim: int, mask: Tensor | None) -> Tensor:
 
 
 def _representable(values: Tensor) -> Tensor:
-    """Clip overflow to the largest finite numbers, so that a softmax of it is a softmax."""
-    largest = torch.finfo(values.dtype).max
+    """Clip overflow: a softmax of the result is a maximum, and differences stay finite."""
+    largest = torch.finfo(values.dtype).max / 4
     return values.clamp(-largest, largest)
 
 

@@ -1,0 +1,840 @@
+"""The equations: numbers worked out by hand, exact enumeration, gradients, and properties."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.testing import assert_close
+
+from torchrl_ecpo.functional import (
+    Surrogate,
+    check_temperatures,
+    effective_sample_size,
+    lifted_log_weights,
+    mean_seeking_projection,
+    ment_surrogate,
+    mode_seeking_projection,
+    self_normalised_weights,
+    soft_value,
+    soft_value_estimate,
+    surrogate_reward,
+    surrogate_reward_estimate,
+    theorem1_temperatures,
+    urex_surrogate,
+)
+
+DTYPES = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+PROPERTY = settings(derandomize=True, deadline=None, max_examples=25, database=None)
+
+
+def vector(*values: float, dtype: torch.dtype = torch.float64) -> Tensor:
+    return torch.tensor(values, dtype=dtype)
+
+
+def gradient(loss: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
+    at = at.detach().requires_grad_()
+    return torch.autograd.grad(loss(at).sum(), at)[0]
+
+
+# ------------------------------------------------------------------ every function, one signature
+
+
+class Samples(NamedTuple):
+    """What the functions read, each ``[E*, K]``."""
+
+    score: Tensor
+    log_prob: Tensor
+    reference: Tensor
+    behaviour: Tensor
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Samples:
+        return Samples(*map(function, self))
+
+
+class Result(NamedTuple):
+    """``value`` is [E*]; ``per_sample`` is [E*, K]: the gradients and, of a surrogate, weights."""
+
+    value: Tensor
+    per_sample: tuple[Tensor, ...]
+
+
+def _mean_seeking(x: Samples, tau, tau_prime, **where) -> Surrogate:
+    log_weights = lifted_log_weights(x.score, x.reference, tau=tau, tau_prime=tau_prime)
+    return mean_seeking_projection(x.log_prob, log_weights, **where)
+
+
+def _mean_seeking_controlled(x: Samples, tau, tau_prime, **where) -> Surrogate:
+    log_weights = lifted_log_weights(x.score, x.reference, tau=tau, tau_prime=tau_prime)
+    log_weights = log_weights + x.reference - x.behaviour
+    return mean_seeking_projection(x.log_prob, log_weights, control_log_prob=x.behaviour, **where)
+
+
+def _mode_seeking(x: Samples, tau, tau_prime, **where) -> Surrogate:
+    log_weights = lifted_log_weights(x.score, x.reference, tau=tau, tau_prime=tau_prime)
+    return mode_seeking_projection(x.log_prob, x.reference, log_weights, **where)
+
+
+def _mode_seeking_older_data(x: Samples, tau, tau_prime, **where) -> Surrogate:
+    log_weights = lifted_log_weights(x.score, x.reference, tau=tau, tau_prime=tau_prime)
+    return mode_seeking_projection(
+        x.log_prob, x.reference, log_weights, behaviour_log_prob=x.behaviour, **where
+    )
+
+
+def _urex(x: Samples, tau, tau_prime, **where) -> Surrogate:
+    return urex_surrogate(x.log_prob, x.score, tau=tau, **where)
+
+
+def _ment(x: Samples, tau, tau_prime, **where) -> Surrogate:
+    return ment_surrogate(x.log_prob, x.score, tau=tau, **where)
+
+
+def _value(function: Callable[..., Tensor]):
+    def call(x: Samples, tau, tau_prime, **where) -> Tensor:
+        return function(x.score, x.log_prob, tau=tau, tau_prime=tau_prime, **where)
+
+    return call
+
+
+SURROGATES = {
+    "mean_seeking": _mean_seeking,
+    "mean_seeking_controlled": _mean_seeking_controlled,
+    "mode_seeking": _mode_seeking,
+    "mode_seeking_older_data": _mode_seeking_older_data,
+    "urex": _urex,
+    "ment": _ment,
+}
+VALUES = {
+    function.__name__: _value(function)
+    for function in (soft_value, soft_value_estimate, surrogate_reward, surrogate_reward_estimate)
+}
+FUNCTIONS = SURROGATES | VALUES
+every_function = pytest.mark.parametrize("name", FUNCTIONS)
+every_surrogate = pytest.mark.parametrize("name", SURROGATES)
+
+
+def evaluate(
+    name: str,
+    samples: Samples,
+    tau: float | Tensor = 0.5,
+    tau_prime: float | Tensor = 0.25,
+    **where,
+) -> Result:
+    samples = samples.map(lambda tensor: tensor.detach().clone().requires_grad_())
+    output = FUNCTIONS[name](samples, tau, tau_prime, **where)
+    value, weights = (output.loss, output.weights) if name in SURROGATES else (output, None)
+    gradients = torch.autograd.grad(value.sum(), samples, allow_unused=True)
+    present = [tensor for tensor in (weights, *gradients) if tensor is not None]
+    return Result(value.detach(), tuple(present))
+
+
+@st.composite
+def groups(draw: st.DrawFn, k: int | None = None) -> Samples:
+    """One group of K samples."""
+    k = draw(st.integers(1, 6)) if k is None else k
+    log_probs = st.lists(st.floats(-8, 0), min_size=k, max_size=k).map(lambda x: vector(*x))
+    scores = st.lists(st.floats(-4, 4), min_size=k, max_size=k).map(lambda x: vector(*x))
+    return Samples(draw(scores), draw(log_probs), draw(log_probs), draw(log_probs))
+
+
+def random_samples(*shape: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> Samples:
+    generator = torch.Generator().manual_seed(seed)
+    score, *logits = torch.randn(4, *shape, generator=generator, dtype=dtype)
+    return Samples(score, *(x.log_softmax(-1) for x in logits))
+
+
+# ----------------------------------------------------------------------------- numbers by hand
+
+
+@DTYPES
+def test_lifted_log_weights_by_hand(dtype):
+    score, reference = vector(1, 0, -3, dtype=dtype), vector(-2, -1, 0, dtype=dtype)
+    # (1 + .5 * 2) / 2, (0 + .5 * 1) / 2, (-3 + 0) / 2
+    actual = lifted_log_weights(score, reference, tau=1.5, tau_prime=0.5)
+    assert_close(actual, vector(1.0, 0.25, -1.5, dtype=dtype))
+
+
+@DTYPES
+@pytest.mark.parametrize(
+    ("mask", "expected"),
+    [
+        (None, (1 / 8, 2 / 8, 5 / 8)),
+        ((True, True, False), (1 / 3, 2 / 3, 0)),
+        ((False, False, True), (0, 0, 1)),
+        ((False, False, False), (0, 0, 0)),
+    ],
+)
+def test_self_normalised_weights_by_hand(dtype, mask, expected):
+    log_weights = vector(1, 2, 5, dtype=dtype).log()
+    actual = self_normalised_weights(log_weights, mask=None if mask is None else torch.tensor(mask))
+    assert_close(actual, vector(*expected, dtype=dtype))
+
+
+def test_masked_samples_take_no_weight_from_the_lowest_representable_one():
+    lowest = torch.finfo(torch.float64).min
+    mask = torch.tensor([True, False, True])
+    actual = self_normalised_weights(vector(lowest, 0, lowest), mask=mask)
+    assert_close(actual, vector(0.5, 0, 0.5))
+
+
+@DTYPES
+@pytest.mark.parametrize(
+    ("weights", "expected"),
+    [
+        ((0.5, 0.25, 0.25), 8 / 3),  # 1 / (1/4 + 1/16 + 1/16)
+        ((2.0, 1.0, 1.0), 8 / 3),  # no need to be normalised
+        ((0.0, 7.0, 0.0), 1.0),
+        ((0.1, 0.1, 0.1), 3.0),
+        ((1e-30, 1e-30, 0.0), 2.0),  # in float32 the square would underflow
+        ((1e30, 1e30, 1e30), 3.0),  # and here overflow
+        ((0.0, 0.0, 0.0), 0.0),
+    ],
+)
+def test_effective_sample_size_by_hand(dtype, weights, expected):
+    assert_close(effective_sample_size(vector(*weights, dtype=dtype)).item(), expected)
+
+
+@DTYPES
+def test_mean_seeking_projection_by_hand(dtype):
+    log_prob = vector(-1, -2, -3, dtype=dtype)
+    log_weights = vector(1, 2, 5, dtype=dtype).log()
+    loss, weights = mean_seeking_projection(log_prob, log_weights)
+    assert_close(weights, vector(1 / 8, 2 / 8, 5 / 8, dtype=dtype))
+    assert_close(loss.item(), (1 * 1 + 2 * 2 + 5 * 3) / 8)
+    grad = gradient(lambda x: mean_seeking_projection(x, log_weights).loss, log_prob)
+    assert_close(grad, vector(-1 / 8, -2 / 8, -5 / 8, dtype=dtype))
+
+
+@DTYPES
+def test_control_variate_by_hand(dtype):
+    log_prob = vector(-1, -2, -3, dtype=dtype)
+    log_weights = vector(1, 2, 5, dtype=dtype).log()
+    control = log_prob - vector(1, 1, 2, dtype=dtype).log()  # ratios 1/4, 1/4, 1/2
+
+    def loss(x: Tensor) -> Tensor:
+        return mean_seeking_projection(x, log_weights, control_log_prob=control).loss
+
+    # Coefficients 1/8 - 2/8, 2/8 - 2/8, 5/8 - 4/8.
+    # Three numbers near 1 are subtracted: some units in the last place of 1 are lost.
+    tolerance = {"atol": 8 * torch.finfo(dtype).eps, "rtol": 0.0}
+    assert_close(loss(log_prob).item(), -(-1 * -1 + 0 * -2 + 1 * -3) / 8, **tolerance)
+    expected = vector(1 / 8, 0, -1 / 8, dtype=dtype)
+    assert_close(gradient(loss, log_prob), expected, **tolerance)
+
+
+@DTYPES
+def test_mode_seeking_projection_by_hand(dtype):
+    log_prob = vector(-1, -2, -3, dtype=dtype)
+    behaviour = log_prob - vector(2, 1, 1, dtype=dtype).log()  # v = 1/2, 1/4, 1/4
+    reference = log_prob - vector(1, 0, -1, dtype=dtype)
+    log_weights = vector(2, 4, 3, dtype=dtype)  # A = 1, 4, 4; mean 5/2
+
+    def surrogate(x: Tensor) -> Surrogate:
+        return mode_seeking_projection(x, reference, log_weights, behaviour_log_prob=behaviour)
+
+    assert_close(surrogate(log_prob).weights, vector(1 / 2, 1 / 4, 1 / 4, dtype=dtype))
+    # v (A - mean) = -3/4, 3/8, 3/8
+    assert_close(surrogate(log_prob).loss.item(), -(3 / 4 - 3 / 4 - 9 / 8))
+    grad = gradient(lambda x: surrogate(x).loss, log_prob)
+    assert_close(grad, vector(3 / 4, -3 / 8, -3 / 8, dtype=dtype))
+
+
+def test_mode_seeking_projection_takes_the_reference_for_the_sampler_by_default():
+    x = random_samples(3, 5)
+    log_weights = lifted_log_weights(x.score, x.reference, tau=0.5, tau_prime=0.25)
+    default = mode_seeking_projection(x.log_prob, x.reference, log_weights)
+    explicit = mode_seeking_projection(
+        x.log_prob, x.reference, log_weights, behaviour_log_prob=x.reference
+    )
+    assert_close(tuple(default), tuple(explicit))
+    assert_close(default.weights, (x.log_prob - x.reference).softmax(-1))
+
+
+@DTYPES
+def test_urex_surrogate_by_hand(dtype):
+    # r / tau - log pi = 1, 1 + log 3, so w = 1/4, 3/4; S = 0 + 1/4, .5 log 1.5 + 3/4.
+    log_prob = vector(-1, -1 - math.log(2), dtype=dtype)
+    score = vector(0, 0.5 * math.log(1.5), dtype=dtype)
+    loss, weights = urex_surrogate(log_prob, score, tau=0.5)
+    quarter = (0.5 + 0.5 * math.log(1.5)) / 4  # half the distance to the mean, over K
+    assert_close(weights, vector(0.25, 0.75, dtype=dtype))
+    assert_close(loss.item(), quarter * math.log(2))
+    grad = gradient(lambda x: urex_surrogate(x, score, tau=0.5).loss, log_prob)
+    assert_close(grad, vector(quarter, -quarter, dtype=dtype))
+
+
+@DTYPES
+def test_ment_surrogate_by_hand(dtype):
+    log_prob, score = vector(-2, -1, -3, dtype=dtype), vector(1, 2, 3, dtype=dtype)
+    loss, weights = ment_surrogate(log_prob, score, tau=0.5)  # S = 2, 2.5, 4.5; mean 3
+    assert_close(weights, vector(1 / 3, 1 / 3, 1 / 3, dtype=dtype))
+    assert_close(loss.item(), -(-1 * -2 - 0.5 * -1 + 1.5 * -3) / 3)
+    grad = gradient(lambda x: ment_surrogate(x, score, tau=0.5).loss, log_prob)
+    assert_close(grad, vector(1 / 3, 1 / 6, -1 / 2, dtype=dtype))
+
+
+@DTYPES
+@pytest.mark.parametrize(
+    ("tau", "tau_prime", "score", "probability", "value"),
+    [
+        (1.0, 0.0, (math.log(4), math.log(8 / 3)), (1 / 4, 3 / 4), math.log(1 + 2)),
+        (1.0, 1.0, (2 * math.log(2), 2 * math.log(8)), (1 / 4, 1 / 16), 2 * math.log(1 + 2)),
+        (0.0, 0.5, (0.5 * math.log(3), 0.5 * math.log(5)), (1 / 4, 3 / 4), 0.5 * math.log(8)),
+    ],
+)
+@pytest.mark.parametrize("function", [soft_value, surrogate_reward])
+def test_soft_value_by_hand(function, dtype, tau, tau_prime, score, probability, value):
+    log_prob = vector(*probability, dtype=dtype).log()
+    actual = function(vector(*score, dtype=dtype), log_prob, tau=tau, tau_prime=tau_prime)
+    assert_close(actual.item(), value)
+
+
+@DTYPES
+@pytest.mark.parametrize("function", [soft_value_estimate, surrogate_reward_estimate])
+def test_soft_value_estimate_by_hand(function, dtype):
+    # exp(Q / 2) / sqrt(pi_bar) = 1 * 2, 2.5 * 4, whose mean is 6.
+    score = vector(0, 2 * math.log(2.5), dtype=dtype)
+    log_prob = vector(1 / 4, 1 / 16, dtype=dtype).log()
+    actual = function(score, log_prob, tau=1.0, tau_prime=1.0)
+    assert_close(actual.item(), 2 * math.log(6))
+
+
+def test_theorem1_temperatures_by_hand():
+    tau, tau_prime = theorem1_temperatures(100, 2)  # log 2 = .693147
+    assert_close((tau_prime, tau + tau_prime), (0.1201122, 8.4932181), atol=1e-6, rtol=0)
+    for horizon, n in itertools.product((2, 10, 1e6), (2, 3, 10_000)):
+        tau, tau_prime = theorem1_temperatures(horizon, n)
+        assert tau > 0
+        assert_close(tau_prime**2 * horizon * math.log(n), 1.0)
+        assert_close((tau + tau_prime) ** 2 * 2 * math.log(n) / horizon, 1.0)
+    assert theorem1_temperatures(1, 10)[0] == 0
+
+
+# ------------------------------------------------------------------------------ exact enumeration
+#
+# A group that holds outcome i c_i times, drawn by a policy with probabilities c_i / sum c, is what
+# self-normalisation assumes in the limit: sample sums are then exact expectations.
+
+COUNTS = pytest.mark.parametrize(
+    "counts", [(1, 1, 1, 1, 1), (1, 2, 3, 4, 5), (7, 1, 1, 1, 2)], ids=str
+)
+TEMPERATURES = pytest.mark.parametrize(
+    ("tau", "tau_prime"), [(0.5, 0.25), (0.3, 0.0), (0.0, 0.4), (2.0, 5.0)]
+)
+
+
+class Enumeration(NamedTuple):
+    """A softmax policy over five outcomes, its reference, and a sample without sampling error."""
+
+    logits: Tensor
+    reference: Tensor
+    score: Tensor
+    index: Tensor
+    behaviour: Tensor
+
+    def lifted(self, tau: float, tau_prime: float) -> Tensor:
+        """Log-probability of the target: the display of Eq. 5, term by term."""
+        reference = self.reference.exp()
+        target = reference * ((self.score - tau_prime * self.reference) / (tau + tau_prime)).exp()
+        return (target / target.sum()).log()
+
+    def log_weights(self, tau: float, tau_prime: float) -> Tensor:
+        return lifted_log_weights(self.score, self.reference, tau=tau, tau_prime=tau_prime)
+
+
+def enumeration(counts: tuple[int, ...], on_policy: bool) -> Enumeration:
+    logits, other, score = random_samples(len(counts), seed=3)[:3]
+    reference = (logits if on_policy else other).log_softmax(-1)
+    count = torch.tensor(counts)
+    behaviour = vector(*counts).log() - math.log(sum(counts))
+    return Enumeration(
+        logits, reference, score, torch.arange(len(counts)).repeat_interleave(count), behaviour
+    )
+
+
+@COUNTS
+@TEMPERATURES
+@pytest.mark.parametrize("on_policy", [True, False])
+@pytest.mark.parametrize("controlled", [False, True])
+def test_mean_seeking_gradient_is_exact_on_an_exact_sample(
+    counts, tau, tau_prime, on_policy, controlled
+):
+    case = enumeration(counts, on_policy)
+    log_weights = case.log_weights(tau, tau_prime) + case.reference - case.behaviour
+    target = case.lifted(tau, tau_prime)
+
+    def estimator(logits: Tensor) -> Tensor:
+        return mean_seeking_projection(
+            logits.log_softmax(-1)[case.index],
+            log_weights[case.index],
+            control_log_prob=case.behaviour[case.index] if controlled else None,
+        ).loss
+
+    def divergence(logits: Tensor) -> Tensor:
+        return (target.exp() * (target - logits.log_softmax(-1))).sum()
+
+    expected = gradient(divergence, case.logits)
+    assert_close(gradient(estimator, case.logits), expected)
+    # The same, written out: softmax policy minus target.
+    assert_close(expected, case.logits.softmax(-1) - target.exp())
+
+
+@COUNTS
+@TEMPERATURES
+@pytest.mark.parametrize("on_policy", [True, False])
+def test_mode_seeking_gradient_is_exact_on_an_exact_sample(counts, tau, tau_prime, on_policy):
+    case = enumeration(counts, on_policy)
+    target = case.lifted(tau, tau_prime)
+
+    def estimator(logits: Tensor) -> Tensor:
+        return mode_seeking_projection(
+            logits.log_softmax(-1)[case.index],
+            case.reference[case.index],
+            case.log_weights(tau, tau_prime)[case.index],
+            behaviour_log_prob=case.behaviour[case.index],
+        ).loss
+
+    def divergence(logits: Tensor) -> Tensor:
+        log_prob = logits.log_softmax(-1)
+        return (log_prob.exp() * (log_prob - target)).sum()
+
+    expected = gradient(divergence, case.logits)
+    assert_close(gradient(estimator, case.logits), expected)
+    # The same, written out: pi (log pi - log q - KL).
+    log_prob = case.logits.log_softmax(-1)
+    assert_close(expected, log_prob.exp() * (log_prob - target - divergence(case.logits)))
+
+
+@pytest.mark.parametrize("tau", [0.1, 1.0])
+def test_ment_gradient_is_exact_on_an_exact_sample(tau):
+    """With samples in proportion to pi, MENT ascends E r + tau H."""
+    counts = (1, 2, 3, 4, 5)
+    case = enumeration(counts, on_policy=True)
+    logits = case.behaviour
+
+    def estimator(logits: Tensor) -> Tensor:
+        log_prob = logits.log_softmax(-1)[case.index]
+        return ment_surrogate(log_prob, case.score[case.index], tau=tau).loss
+
+    def objective(logits: Tensor) -> Tensor:
+        log_prob = logits.log_softmax(-1)
+        return -(log_prob.exp() * (case.score - tau * log_prob)).sum()
+
+    assert_close(gradient(estimator, logits), gradient(objective, logits))
+
+
+@pytest.mark.parametrize("tau", [0.1, 1.0])
+def test_urex_gradient_is_exact_on_an_exact_sample(tau):
+    """With samples in proportion to pi, UREX ascends E r - tau KL(q, pi), q ~ exp(r / tau)."""
+    case = enumeration((1, 2, 3, 4, 5), on_policy=True)
+    logits = case.behaviour
+    target = (case.score / tau).log_softmax(-1)
+
+    def estimator(logits: Tensor) -> Tensor:
+        log_prob = logits.log_softmax(-1)[case.index]
+        return urex_surrogate(log_prob, case.score[case.index], tau=tau).loss
+
+    def objective(logits: Tensor) -> Tensor:
+        log_prob = logits.log_softmax(-1)
+        reward = (log_prob.exp() * case.score).sum()
+        return -(reward - tau * (target.exp() * (target - log_prob)).sum())
+
+    assert_close(gradient(estimator, logits), gradient(objective, logits))
+
+
+@COUNTS
+@TEMPERATURES
+@pytest.mark.parametrize(
+    ("exact", "estimate"),
+    [(soft_value, soft_value_estimate), (surrogate_reward, surrogate_reward_estimate)],
+)
+def test_value_estimate_is_exact_on_an_exact_sample(exact, estimate, counts, tau, tau_prime):
+    case = enumeration(counts, on_policy=False)
+    temperatures = {"tau": tau, "tau_prime": tau_prime}
+    assert_close(
+        estimate(case.score[case.index], case.behaviour[case.index], **temperatures),
+        exact(case.score, case.behaviour, **temperatures),
+    )
+
+
+@TEMPERATURES
+def test_value_estimate_is_a_lower_bound_in_expectation_and_converges(tau, tau_prime):
+    case = enumeration((1, 2, 3), on_policy=False)
+    exact = soft_value(case.score, case.reference, tau=tau, tau_prime=tau_prime)
+
+    def expectation(m: int) -> Tensor:
+        """Over all M-tuples of samples."""
+        tuples = torch.cartesian_prod(*[torch.arange(3)] * m).reshape(-1, m)
+        reference = case.reference[tuples]
+        estimate = soft_value_estimate(case.score[tuples], reference, tau=tau, tau_prime=tau_prime)
+        return (reference.sum(-1).exp() * estimate).sum()
+
+    gaps = [exact - expectation(m) for m in (1, 2, 4, 8)]
+    assert all(left > right > 0 for left, right in itertools.pairwise(gaps))
+    draws = torch.multinomial(
+        case.reference.exp(), 100_000, True, generator=torch.Generator().manual_seed(0)
+    )
+    estimate = soft_value_estimate(
+        case.score[draws], case.reference[draws], tau=tau, tau_prime=tau_prime
+    )
+    assert_close(estimate, exact, atol=0.02, rtol=0)
+
+
+# ------------------------------------------------------------------------------------- identities
+
+
+def test_urex_weights_are_lifted_weights_at_tau_zero():
+    x = random_samples(3, 5)
+    lifted = lifted_log_weights(x.score, x.log_prob, tau=0.0, tau_prime=0.7)
+    actual = urex_surrogate(x.log_prob, x.score, tau=0.7).weights
+    assert_close(actual, self_normalised_weights(lifted))
+    assert_close(actual, (x.score / 0.7 - x.log_prob).softmax(-1))
+
+
+def test_pmd_at_the_reference_is_reinforce_with_mean_baseline_over_tau():
+    x = random_samples(3, 5)
+    log_weights = lifted_log_weights(x.score, x.log_prob, tau=0.7, tau_prime=0.0)
+    pmd = gradient(
+        lambda log_prob: mode_seeking_projection(log_prob, x.log_prob, log_weights).loss, x.log_prob
+    )
+    reinforce = gradient(
+        lambda log_prob: ment_surrogate(log_prob, x.score, tau=0.0).loss, x.log_prob
+    )
+    assert_close(pmd, reinforce / 0.7)
+    assert_close(pmd, -(x.score - x.score.mean(-1, keepdim=True)) / (5 * 0.7))
+
+
+def test_ecpo_without_entropy_weights_by_the_exponential_score():
+    x = random_samples(3, 5)
+    log_weights = lifted_log_weights(x.score, x.reference, tau=0.7, tau_prime=0.0)
+    weights = mean_seeking_projection(x.log_prob, log_weights).weights
+    exponential = (x.score / 0.7).exp()
+    assert_close(weights, exponential / exponential.sum(-1, keepdim=True))
+
+
+def test_equal_scores_without_entropy_weight_all_samples_equally():
+    x = random_samples(3, 5)
+    log_weights = lifted_log_weights(torch.ones(3, 5).double(), x.reference, tau=0.7, tau_prime=0.0)
+    weights = mean_seeking_projection(x.log_prob, log_weights).weights
+    assert_close(weights, torch.full_like(weights, 0.2))
+    assert_close(effective_sample_size(weights), torch.full((3,), 5.0).double())
+
+
+def test_control_variate_removes_the_drift_of_a_neutral_group():
+    """At the reference with equal log-weights the gradient is zero per group, not on average."""
+    x = random_samples(3, 5)
+    neutral = torch.full((3, 5), 1.5, dtype=torch.float64)
+
+    def grad(control: Tensor | None) -> Tensor:
+        return gradient(
+            lambda y: mean_seeking_projection(y, neutral, control_log_prob=control).loss,
+            x.log_prob,
+        )
+
+    assert_close(grad(x.log_prob), torch.zeros(3, 5).double())
+    assert_close(grad(None), torch.full((3, 5), -0.2).double())
+
+
+@PROPERTY
+@given(x=groups())
+def test_control_variate_coefficients_sum_to_zero(x):
+    grad = evaluate("mean_seeking_controlled", x).per_sample[1]
+    assert_close(grad.sum(), vector(0)[0], atol=1e-12, rtol=0)
+
+
+@TEMPERATURES
+@pytest.mark.parametrize("function", [soft_value_estimate, surrogate_reward_estimate])
+def test_one_sample_estimate_is_score_minus_entropy_term(function, tau, tau_prime):
+    x = random_samples(6, 1)
+    actual = function(x.score, x.reference, tau=tau, tau_prime=tau_prime)
+    assert_close(actual, (x.score - tau_prime * x.reference).squeeze(-1))
+
+
+@PROPERTY
+@given(x=groups(k=5), tau=st.floats(0, 3), tau_prime=st.floats(0.05, 3), seed=st.integers(0, 2**16))
+def test_soft_value_is_the_maximum_and_the_lifted_policy_attains_it(x, tau, tau_prime, seed):
+    reference = x.reference.log_softmax(-1)
+
+    def objective(log_prob: Tensor) -> Tensor:
+        terms = x.score - tau * (log_prob - reference) - tau_prime * log_prob
+        return (log_prob.exp() * terms).sum(-1)
+
+    value = soft_value(x.score, reference, tau=tau, tau_prime=tau_prime)
+    lifted = lifted_log_weights(x.score, reference, tau=tau, tau_prime=tau_prime) + reference
+    assert_close(objective(lifted.log_softmax(-1)), value)
+    others = 4 * random_samples(100, 5, seed=seed).score
+    assert (objective(others.log_softmax(-1)) <= value + 1e-9).all()
+
+
+# ------------------------------------------------------------------------------------- properties
+
+
+@PROPERTY
+@given(x=groups(), tau=st.floats(0.01, 5), tau_prime=st.floats(0, 5))
+@every_surrogate
+def test_weights_are_a_distribution_and_ess_counts_them(name, x, tau, tau_prime):
+    weights = evaluate(name, x, tau, tau_prime).per_sample[0]
+    assert (weights >= 0).all()
+    assert_close(weights.sum(-1).item(), 1.0)
+    assert 1 - 1e-9 <= effective_sample_size(weights).item() <= weights.numel() + 1e-9
+
+
+@PROPERTY
+@given(x=groups(), data=st.data())
+@every_function
+def test_permuting_the_samples_permutes_the_result(name, x, data):
+    order = torch.tensor(data.draw(st.permutations(range(x.score.numel()))))
+    straight, permuted = evaluate(name, x), evaluate(name, x.map(lambda y: y[order]))
+    assert_close(permuted.value, straight.value)
+    assert_close(permuted.per_sample, tuple(y[order] for y in straight.per_sample))
+
+
+@PROPERTY
+@given(x=groups(), constant=st.floats(-10, 10))
+@every_function
+def test_a_constant_added_to_the_score_moves_values_and_nothing_else(name, x, constant):
+    shifted = evaluate(name, x._replace(score=x.score + constant))
+    straight = evaluate(name, x)
+    moved = constant if name in VALUES else 0.0
+    assert_close(shifted.value, straight.value + moved, atol=1e-9, rtol=1e-9)
+    assert_close(shifted.per_sample, straight.per_sample, atol=1e-9, rtol=1e-9)
+
+
+@PROPERTY
+@given(x=groups(), data=st.data())
+@every_function
+def test_masked_samples_have_no_influence_whatever_stands_in_them(name, x, data):
+    k = x.score.numel()
+    mask = torch.tensor(data.draw(st.lists(st.booleans(), min_size=k, max_size=k).filter(any)))
+    anything = st.sampled_from([math.nan, math.inf, -math.inf, 0.0, 1e300, -1e300, 3.0])
+    garbage = vector(*data.draw(st.lists(anything, min_size=k, max_size=k)))
+    masked = evaluate(name, x.map(lambda y: y.where(mask, garbage)), mask=mask)
+    alone = evaluate(name, x.map(lambda y: y[mask]))
+    assert_close(masked.value, alone.value)
+    assert_close(tuple(y[mask] for y in masked.per_sample), alone.per_sample)
+    for per_sample in masked.per_sample:
+        assert (per_sample[~mask] == 0).all()
+
+
+@every_surrogate
+def test_only_the_log_probability_carries_a_gradient(name):
+    samples = random_samples(3, 5).map(lambda y: y.requires_grad_())
+    loss, weights = SURROGATES[name](samples, 0.5, 0.25)
+    assert not weights.requires_grad
+    loss.sum().backward()
+    assert samples.log_prob.grad is not None
+    assert [y.grad for y in samples._replace(log_prob=samples.score)] == [None] * 4
+
+
+@every_surrogate
+def test_a_group_without_a_real_sample_has_no_loss_and_no_gradient(name):
+    x = random_samples(2, 3).map(lambda y: torch.stack([y[0], torch.full_like(y[1], math.nan)]))
+    mask = torch.tensor([[True] * 3, [False] * 3])
+    value, per_sample = evaluate(name, x, mask=mask)
+    assert value[1] == 0
+    assert_close(value[0], evaluate(name, x.map(lambda y: y[0])).value)
+    assert all((y[1] == 0).all() for y in per_sample)
+    assert effective_sample_size(per_sample[0])[1] == 0
+
+
+@every_function
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("shape", [(), (2,), (2, 3), (2, 1, 3)], ids=str)
+def test_leading_shapes_and_sample_dim(name, shape, masked):
+    """Groups are independent, and the sample axis may stand anywhere."""
+    x = random_samples(*shape, 4)
+    mask = random_samples(*shape, 4, seed=1).score > -0.5 if masked else None
+    expected = evaluate(name, x, mask=mask)
+    assert expected.value.shape == shape
+    for group in itertools.product(*map(range, shape)):
+        one = evaluate(
+            name, x.map(lambda y, i=group: y[i]), mask=None if mask is None else mask[group]
+        )
+        assert_close(one.value, expected.value[group])
+        assert_close(one.per_sample, tuple(y[group] for y in expected.per_sample))
+    for dim in range(-len(shape) - 1, len(shape) + 1):
+        moved = evaluate(
+            name,
+            x.map(lambda y, d=dim: y.movedim(-1, d)),
+            sample_dim=dim,
+            mask=None if mask is None else mask.movedim(-1, dim),
+        )
+        assert_close(moved.value, expected.value)
+        assert_close(tuple(y.movedim(dim, -1) for y in moved.per_sample), expected.per_sample)
+
+
+@pytest.mark.parametrize("dim", [-3, -2, 0, 1, 2])
+def test_effective_sample_size_and_weights_take_the_sample_dim(dim):
+    log_weights = random_samples(2, 3, 4).score
+    weights = self_normalised_weights(log_weights)
+    moved = self_normalised_weights(log_weights.movedim(-1, dim), sample_dim=dim)
+    assert_close(moved.movedim(dim, -1), weights)
+    assert_close(effective_sample_size(moved, sample_dim=dim), effective_sample_size(weights))
+
+
+@DTYPES
+@every_function
+@pytest.mark.parametrize("masked", [False, True])
+def test_dtype_is_kept(name, dtype, masked):
+    x = random_samples(2, 4, dtype=dtype)
+    mask = torch.tensor([True, True, False, True]).expand(2, 4) if masked else None
+    value, per_sample = evaluate(name, x, mask=mask)
+    assert value.dtype == dtype
+    assert {y.dtype for y in per_sample} == {dtype}
+    double = evaluate(name, x.map(Tensor.double), mask=mask)
+    assert_close(value.double(), double.value, atol=1e-5, rtol=1e-5)
+
+
+@every_function
+@pytest.mark.parametrize("temperature_dtype", [torch.float32, torch.float64], ids=str)
+def test_temperatures_may_be_tensors(name, temperature_dtype):
+    x = random_samples(2, 4, dtype=torch.float32)
+    tau, tau_prime = torch.tensor([0.5, 0.25], dtype=temperature_dtype)
+    result = evaluate(name, x, tau, tau_prime)
+    assert result.value.dtype == torch.float32
+    expected = evaluate(name, x, 0.5, 0.25)
+    assert_close(result.value, expected.value)
+    assert_close(result.per_sample, expected.per_sample)
+
+
+EXTREME_SCORES = st.sampled_from([-1e30, -1.0, 0.0, 1.0, 1e30]) | st.floats(-1e30, 1e30)
+EXTREME_LOG_PROBS = st.sampled_from([-1e30, -1e5, -1.0, 0.0]) | st.floats(-1e30, 0)
+EXTREME_TEMPERATURES = st.floats(-8, 8).map(lambda exponent: 10.0**exponent)
+
+
+@settings(PROPERTY, max_examples=100)
+@given(
+    data=st.data(),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+    tau=EXTREME_TEMPERATURES,
+    tau_prime=st.just(0.0) | EXTREME_TEMPERATURES,
+)
+@every_function
+def test_finite_input_never_gives_nan(name, data, dtype, tau, tau_prime):
+    k = data.draw(st.integers(1, 4))
+    rows = [
+        data.draw(st.lists(values, min_size=k, max_size=k))
+        for values in (EXTREME_SCORES, *[EXTREME_LOG_PROBS] * 3)
+    ]
+    samples = Samples(*(torch.tensor(row, dtype=dtype) for row in rows))
+    value, per_sample = evaluate(name, samples, tau, tau_prime)
+    assert not value.isnan().any()
+    assert not any(y.isnan().any() for y in per_sample)
+    if name in SURROGATES:
+        weights = per_sample[0]
+        assert (weights >= 0).all()
+        assert_close(weights.sum().item(), 1.0, atol=1e-5, rtol=0)
+        assert 1 - 1e-5 <= effective_sample_size(weights).item() <= k * (1 + 1e-5)
+
+
+@DTYPES
+@every_surrogate
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_largest_numbers_never_give_nan(name, dtype, masked):
+    largest = torch.finfo(dtype).max
+    mask = torch.tensor([True, True, False]) if masked else None
+    for signs in itertools.product((-1, 1), repeat=3):
+        score = largest * vector(*signs, dtype=dtype)
+        for log_prob, reference in itertools.permutations([(-1.0, -200.0, -3.0), (-200.0,) * 3], 2):
+            log_prob, reference = vector(*log_prob, dtype=dtype), vector(*reference, dtype=dtype)
+            samples = Samples(score, log_prob, reference, reference)
+            value, per_sample = evaluate(name, samples, 0.1, 0.1, mask=mask)
+            assert not value.isnan()
+            assert not any(y.isnan().any() for y in per_sample)
+            assert_close(per_sample[0].sum().item(), 1.0)
+
+
+# ----------------------------------------------------------------------------------------- compile
+
+
+@every_surrogate
+@pytest.mark.parametrize(
+    ("backend", "tensor_temperatures"), [("eager", True), ("aot_eager", False)]
+)
+def test_surrogates_compile_without_a_graph_break(name, backend, tensor_temperatures):
+    torch._dynamo.reset()
+    x = random_samples(2, 4)
+    mask = torch.tensor([True, True, False, True]).expand(2, 4)
+    temperatures = (0.5, 0.25)
+    if tensor_temperatures:
+        temperatures = tuple(torch.tensor(t) for t in temperatures)
+    compiled = torch.compile(SURROGATES[name], fullgraph=True, backend=backend)
+    expected = SURROGATES[name](x, *temperatures, mask=mask)
+    assert_close(tuple(compiled(x, *temperatures, mask=mask)), tuple(expected))
+
+    def grad(function) -> Tensor:
+        return gradient(
+            lambda log_prob: function(x._replace(log_prob=log_prob), *temperatures, mask=mask).loss,
+            x.log_prob,
+        )
+
+    assert_close(grad(compiled), grad(SURROGATES[name]))
+
+
+# ------------------------------------------------------------------------------------------ errors
+
+
+@pytest.mark.parametrize(
+    "function", [soft_value, soft_value_estimate, surrogate_reward, lifted_log_weights]
+)
+@pytest.mark.parametrize(
+    ("tau", "tau_prime", "message"),
+    [
+        (-0.1, 0.5, r"tau must be a finite number >= 0, got -0\.1"),
+        (0.5, -0.1, r"tau_prime must be a finite number >= 0, got -0\.1"),
+        (math.nan, 0.5, r"tau must be a finite number >= 0, got nan"),
+        (0.5, math.inf, r"tau_prime must be a finite number >= 0, got inf"),
+        (0.0, 0.0, r"tau \+ tau_prime must be positive, got 0.*Set a temperature above 0"),
+    ],
+)
+def test_bad_temperatures_are_refused(function, tau, tau_prime, message):
+    x = random_samples(4)
+    with pytest.raises(ValueError, match=message):
+        function(x.score, x.reference, tau=tau, tau_prime=tau_prime)
+
+
+@pytest.mark.parametrize("name", ["urex", "ment"])
+@pytest.mark.parametrize("tau", [-1.0, math.nan, math.inf])
+def test_bad_tau_is_refused(name, tau):
+    with pytest.raises(ValueError, match=f"tau must be a finite number >= 0, got {tau}"):
+        SURROGATES[name](random_samples(4), tau, None)
+
+
+def test_urex_needs_a_temperature_and_ment_does_not():
+    x = random_samples(4)
+    with pytest.raises(ValueError, match="tau must be positive, got 0"):
+        urex_surrogate(x.log_prob, x.score, tau=0.0)
+    assert ment_surrogate(x.log_prob, x.score, tau=0.0).loss.isfinite()
+
+
+def test_check_temperatures():
+    check_temperatures(tau=0.0, tau_prime=1e-300)
+    check_temperatures(allow_zero=True, tau=0.0, tau_prime=0.0)
+    check_temperatures(tau=torch.tensor(-1.0), tau_prime=0.0)  # tensors are not looked at
+    with pytest.raises(ValueError, match="tau_prime must be a finite number"):
+        check_temperatures(allow_zero=True, tau=0.0, tau_prime=-1.0)
+    with pytest.raises(ValueError, match="tau_prime must be a finite number"):
+        check_temperatures(tau=torch.tensor(1.0), tau_prime=math.nan)
+
+
+@pytest.mark.parametrize(
+    ("horizon", "n", "message"),
+    [
+        (0, 2, "horizon must be at least 1.*, got 0"),
+        (math.nan, 2, "horizon must be at least 1.*, got nan"),
+        (math.inf, 2, "horizon must be at least 1.*, got inf"),
+        (10, 1, "num_trajectories must be at least 2.*, got 1"),
+        (10, math.nan, "num_trajectories must be at least 2.*, got nan"),
+    ],
+)
+def test_theorem1_arguments_are_checked(horizon, n, message):
+    with pytest.raises(ValueError, match=message):
+        theorem1_temperatures(horizon, n)
