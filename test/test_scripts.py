@@ -87,7 +87,7 @@ def test_seeds_are_other_problems_and_schedules_and_ablations_are_options(sweep,
     [
         (["env=chess"], "Could not find 'env/chess'"),
         (["loss.tau=-1"], "tau must be a finite number >= 0, got -1"),
-        (["group_size=1"], "K >= 2 trajectories"),
+        (["group_size=1"], "group_size of at least 2, got num_groups=1, group_size=1"),
     ],
 )
 def test_bad_options_end_with_a_clear_message(tmp_path, overrides, message):
