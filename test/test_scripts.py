@@ -20,7 +20,8 @@ TINY = ("env.num_actions=30", "total_trajectories=60", "group_size=10")
 def start(directory, *overrides):
     flags = [override for override in overrides if override.startswith("--")]
     options = [override for override in overrides if override not in flags]
-    command = [sys.executable, str(ECPO), *flags, *TINY, *options]
+    tiny = () if "env=gym" in options else TINY
+    command = [sys.executable, str(ECPO), *flags, *tiny, *options]
     return subprocess.run(command, capture_output=True, text=True, cwd=directory, check=False)
 
 
@@ -80,6 +81,13 @@ def test_seeds_are_other_problems_and_schedules_and_ablations_are_options(sweep,
     assert scheduled["tau_prime"] == pytest.approx([0.5, 0.375, 0.25, 0.125, 0, 0])
     assert set(without_entropy["tau_prime"]) == {0}
     assert set(without_entropy["kl_to_reference"]) == {0}, "one step a lift: no projection"
+
+
+@pytest.mark.slow  # two to five minutes
+def test_groups_of_eight_learn_cartpole(tmp_path):
+    run_ecpo(tmp_path, "env=gym", "seed=0", "evaluation_interval=10", f"hydra.run.dir={tmp_path}")
+    returns = [value for value in read_metrics(tmp_path)["greedy_return"] if value == value]
+    assert max(returns) >= 475, returns
 
 
 @pytest.mark.parametrize(
