@@ -838,3 +838,32 @@ def test_check_temperatures():
 def test_theorem1_arguments_are_checked(horizon, n, message):
     with pytest.raises(ValueError, match=message):
         theorem1_temperatures(horizon, n)
+
+
+@pytest.mark.parametrize("surrogate", [urex_surrogate, ment_surrogate])
+def test_integer_scores_are_taken_as_numbers(surrogate):
+    log_prob = torch.tensor([-1.0, -2.0, -0.5])
+    score = torch.tensor([1, 0, 2])
+    for got, expected in zip(
+        surrogate(log_prob, score, tau=0.5),
+        surrogate(log_prob, score.float(), tau=0.5),
+        strict=True,
+    ):
+        torch.testing.assert_close(got, expected)
+    values = {"tau": 0.5, "tau_prime": 0.25}
+    torch.testing.assert_close(
+        soft_value_estimate(score, log_prob, **values),
+        soft_value_estimate(score.float(), log_prob, **values),
+    )
+
+
+def test_differences_of_log_probabilities_may_overflow():
+    large = torch.tensor([3e38, -3e38])
+    projections = [
+        mode_seeking_projection(large, large, torch.zeros(2), behaviour_log_prob=-large),
+        mode_seeking_projection(large, -large, torch.zeros(2)),
+        mean_seeking_projection(large, torch.zeros(2), control_log_prob=-large),
+    ]
+    for loss, weights in projections:
+        assert loss.isfinite()
+        assert weights.isfinite().all()

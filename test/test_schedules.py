@@ -25,6 +25,11 @@ class Loss(LossModule):
         self.register_coeff_buffer("tau", 0.5)
         self.register_coeff_buffer("tau_prime", 0.1)
 
+    def __setattr__(self, name, value):
+        super().__setattr__(name, value)
+        if name in self._schedulable_buffers:  # as the losses of the package do
+            assert self.tau + self.tau_prime > 0
+
 
 @pytest.mark.parametrize(
     ("schedule", "expected"),
@@ -61,6 +66,16 @@ def test_scheduler_writes_the_loss_and_counts_what_it_is_told():
     assert loss.tau_prime.item() == pytest.approx(0.1)
     assert loss.tau.item() == 0.5
     assert temperatures.values() == {"tau_prime": pytest.approx(0.1)}
+
+
+def test_temperatures_may_change_places():
+    """At no moment are both 0, although each is at some time."""
+    loss = Loss()
+    swap = {"tau": linear(0.5, 0.0, 1), "tau_prime": linear(0.0, 0.5, 1)}
+    temperatures = TemperatureScheduler(loss, **swap)
+    assert (loss.tau.item(), loss.tau_prime.item()) == (0.5, 0.0)
+    temperatures.step()
+    assert (loss.tau.item(), loss.tau_prime.item()) == (0.0, 0.5)
 
 
 def test_scheduler_continues_from_its_state():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -20,7 +21,7 @@ TINY = ("env.num_actions=30", "total_trajectories=60", "group_size=10")
 def start(directory, *overrides):
     flags = [override for override in overrides if override.startswith("--")]
     options = [override for override in overrides if override not in flags]
-    tiny = () if "env=gym" in options else TINY
+    tiny = () if any(option.startswith("env=") for option in options) else TINY
     command = [sys.executable, str(ECPO), *flags, *tiny, *options]
     return subprocess.run(command, capture_output=True, text=True, cwd=directory, check=False)
 
@@ -83,6 +84,41 @@ def test_seeds_are_other_problems_and_schedules_and_ablations_are_options(sweep,
     assert set(without_entropy["kl_to_reference"]) == {0}, "one step a lift: no projection"
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("env=copy", "total_trajectories=40", "num_groups=2", "evaluation_interval=1"),
+        (
+            "env=reversed_addition",
+            "loss=urex",
+            "total_trajectories=40",
+            "logger.backend=tensorboard",
+        ),
+        ("env=gym", "total_trajectories=64", "env.max_steps=5", "evaluation_interval=1"),
+        (
+            "env=gym",
+            "env.name=Pendulum-v1",
+            "env.max_steps=5",
+            "total_trajectories=64",
+            "loss=ment",
+        ),
+    ],
+)
+def test_every_kind_of_task_runs(tmp_path, options):
+    run_ecpo(tmp_path, "seed=1", f"hydra.run.dir={tmp_path}", *options)
+    metrics = read_metrics(tmp_path)
+    assert metrics["step"][-1] >= 40
+    assert all(math.isfinite(loss) for loss in metrics["loss_actor"])
+
+
+def test_compare_from_the_command_line(sweep):
+    module = "torchrl_ecpo.experiment.compare"
+    command = [sys.executable, "-m", module, str(sweep), "--metric", "expected_reward"]
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert "| ecpo | 1 | 60 |" in process.stdout, process.stderr
+    assert (sweep / "comparison.png").exists()
+
+
 @pytest.mark.slow  # two to five minutes
 def test_groups_of_eight_learn_cartpole(tmp_path):
     run_ecpo(tmp_path, "env=gym", "seed=0", "evaluation_interval=10", f"hydra.run.dir={tmp_path}")
@@ -94,6 +130,8 @@ def test_groups_of_eight_learn_cartpole(tmp_path):
     ("overrides", "message"),
     [
         (["env=chess"], "Could not find 'env/chess'"),
+        (["project_steps=0"], "project_steps must be an integer of at least 1, got 0"),
+        (["anneal_from={metric:foo,at_least:1}"], "anneal_from.metric must be one of"),
         (["loss.tau=-1"], "tau must be a finite number >= 0, got -1"),
         (["group_size=1"], "group_size of at least 2, got num_groups=1, group_size=1"),
     ],

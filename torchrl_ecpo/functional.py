@@ -26,7 +26,9 @@ mask                                  True where a sample is real; absent means 
 ==================== ================ =====================================================
 
 Temperatures are floats or 0-d tensors, in the unit of the score. Floats are checked; tensors are
-taken as they are, so that nothing waits for a device. Finite input never gives NaN.
+taken as they are, so that nothing waits for a device. Finite input never gives NaN, as long as the
+temperatures are neither 0 nor infinite in the dtype of the scores (from 1e-37 to 1e38 in float32).
+A group in which all samples are masked has weights and a loss of 0, and no soft value.
 """
 
 from __future__ import annotations
@@ -228,7 +230,7 @@ def mean_seeking_projection(
     weights = self_normalised_weights(log_weights.detach(), sample_dim=sample_dim, mask=mask)
     coefficients = weights
     if control_log_prob is not None:
-        log_ratio = (log_prob - control_log_prob).detach()
+        log_ratio = _representable((log_prob - control_log_prob).detach())
         coefficients = weights - self_normalised_weights(
             log_ratio, sample_dim=sample_dim, mask=mask
         )
@@ -284,8 +286,9 @@ def mode_seeking_projection(
     if behaviour_log_prob is None:
         behaviour_log_prob = reference_log_prob
     current, behaviour_log_prob = log_prob.detach(), behaviour_log_prob.detach()
-    ratios = self_normalised_weights(current - behaviour_log_prob, sample_dim=sample_dim, mask=mask)
-    advantage = _representable(log_weights - (current - reference_log_prob))
+    log_ratio = _representable(current - behaviour_log_prob)
+    ratios = self_normalised_weights(log_ratio, sample_dim=sample_dim, mask=mask)
+    advantage = _representable(log_weights - _representable(current - reference_log_prob))
     advantage = advantage - _weighted_sum(ratios, advantage, sample_dim, mask, keepdim=True)
     return Surrogate(-_weighted_sum(ratios * advantage, log_prob, sample_dim, mask), ratios)
 
@@ -334,7 +337,7 @@ def urex_surrogate(
     current, score = log_prob.detach(), score.detach()
     log_weights = lifted_log_weights(score, current, tau=0.0, tau_prime=tau)
     weights = self_normalised_weights(log_weights, sample_dim=sample_dim, mask=mask)
-    uniform = _uniform_weights(score, sample_dim, mask)
+    uniform = _uniform_weights(log_prob, sample_dim, mask)
     # A masked sample has weight 0 in both, so the quotient's denominator may be anything there.
     signal = score + tau * weights / uniform.clamp_min(_tiny(uniform))
     return Surrogate(_policy_gradient(log_prob, signal, uniform, sample_dim, mask), weights)
@@ -375,7 +378,7 @@ def ment_surrogate(
         tensor([-0.2500,  0.2500])
     """
     check_temperatures(tau=tau, allow_zero=True)
-    uniform = _uniform_weights(score, sample_dim, mask)
+    uniform = _uniform_weights(log_prob, sample_dim, mask)
     signal = score - tau * log_prob.detach()
     return Surrogate(_policy_gradient(log_prob, signal, uniform, sample_dim, mask), uniform)
 
@@ -461,7 +464,8 @@ def soft_value_estimate(
         tensor(1.5000)
     """
     log_weights = lifted_log_weights(score, reference_log_prob, tau=tau, tau_prime=tau_prime)
-    log_uniform = _uniform_weights(score, sample_dim, mask).clamp_min(_tiny(score)).log()
+    uniform = _uniform_weights(log_weights, sample_dim, mask)
+    log_uniform = uniform.clamp_min(_tiny(uniform)).log()
     return (tau + tau_prime) * _masked_logsumexp(log_weights + log_uniform, sample_dim, mask)
 
 

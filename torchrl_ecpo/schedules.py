@@ -182,7 +182,8 @@ class TemperatureScheduler:
         return {name: float(schedule(self.count)) for name, schedule in self.schedules.items()}
 
     def _write(self) -> None:
-        for name, value in self.values().items():
+        # The largest first: the loss refuses a moment in which all temperatures are 0.
+        for name, value in sorted(self.values().items(), key=lambda item: -item[1]):
             setattr(self.loss_module, name, value)
 
     def state_dict(self) -> dict[str, float]:

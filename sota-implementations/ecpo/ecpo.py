@@ -9,13 +9,14 @@ import hydra
 import torch
 from omegaconf import DictConfig
 from tasks import make_task
-from utils import make_collector, make_loss, make_temperatures, reached
+from utils import check_config, make_collector, make_loss, make_temperatures, reached
 
 from torchrl_ecpo.experiment import Run
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
 def main(config: DictConfig) -> None:
+    check_config(config)
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
 

@@ -20,6 +20,17 @@ LOSSES = {
 TEMPERATURES = ("tau", "tau_prime")
 
 
+def check_config(config: DictConfig) -> None:
+    """Refuse counts with which a run would never end, or never begin."""
+    names = ("total_trajectories", "evaluation_interval", "num_groups", "group_size")
+    for name in (*names, "project_steps", "threads"):
+        value = config[name]
+        if not isinstance(value, int) or value < 1:
+            raise ValueError(f"{name} must be an integer of at least 1, got {value!r}.")
+    if not isinstance(config.seed, int):
+        raise ValueError(f"seed must be an integer, got {config.seed!r}.")
+
+
 def make_collector(config: DictConfig, task: Task) -> TrajectoryGroupCollector:
     """A collector of whole groups ``[num_groups, group_size, T]`` drawn from the reference."""
     collector = TrajectoryGroupCollector(
@@ -49,7 +60,11 @@ def make_temperatures(config: DictConfig, loss_module: TrajectoryGroupLoss) -> T
 
 def reached(goal: DictConfig | None, metrics: Metrics) -> bool:
     """Whether a metric has come up to a goal, ``{metric: ..., at_least: ...}``; always for none."""
-    return goal is None or bool(metrics[goal.metric] >= goal.at_least)
+    if goal is None:
+        return True
+    if goal.metric not in metrics:
+        raise KeyError(f"anneal_from.metric must be one of {sorted(metrics)}, got {goal.metric!r}.")
+    return bool(metrics[goal.metric] >= goal.at_least)
 
 
 def _temperatures(config: DictConfig) -> dict[str, float | dict]:

@@ -39,6 +39,11 @@ def test_an_instance_is_its_seed():
     assert torch.equal(state, torch.get_rng_state()), "the global generator is left alone"
 
 
+def test_it_moves_to_another_device_as_a_whole():
+    env = BanditEnv(num_actions=5, group_size=2).to("meta")
+    assert {buffer.device.type for buffer in env.buffers()} == {"meta"}
+
+
 def test_an_episode_is_one_action_and_its_reward():
     env = BanditEnv(num_actions=6, num_groups=2, group_size=3)
     td = env.reset()

@@ -31,6 +31,7 @@ from trajectory_problems import (
     split,
 )
 
+from torchrl_ecpo.schedules import TemperatureScheduler, theorem1_schedules
 from torchrl_ecpo.updaters import PeriodicCopy, PolyakAverage
 
 SHAPES = [(3, 4), (2, 3, 4), (2, 2, 3, 4)]
@@ -777,3 +778,53 @@ def test_one_of_two_temperatures_may_be_zero():
     loss = CASES["ment"].build(actor)
     loss.tau = 0
     assert loss(batch)["loss_actor"].isfinite()
+
+
+@pytest.mark.parametrize(("name", "temperature"), TEMPERATURES)
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (torch.tensor(-1.0), "must be a finite number >= 0, got -1.0"),
+        ("warm", "must be a number, got 'warm'"),
+        (None, "must be a number, got None"),
+        (torch.ones(2), "must be a number, got tensor"),
+    ],
+)
+def test_a_temperature_of_another_type(name, temperature, value, message):
+    """Tensors are looked at like numbers, and nothing else is taken."""
+    case = CASES[name]
+    with pytest.raises(ValueError, match=rf"{temperature} {message}"):
+        case.loss(make_actor(), **{temperature: value})
+    loss = case.build(make_actor())
+    with pytest.raises(ValueError, match=rf"{temperature} {message}"):
+        setattr(loss, temperature, value)
+    setattr(loss, temperature, torch.tensor(0.25))
+    assert getattr(loss, temperature).item() == 0.25
+    assert temperature in dict(loss.named_buffers())
+
+
+@losses
+@pytest.mark.parametrize("shape", [(0, 4, 5), (3, 4, 0)])
+def test_an_empty_batch(case, shape):
+    """No groups, or no steps."""
+    batch = TensorDict(
+        {
+            "observation": torch.zeros(*shape, 3),
+            "action": torch.zeros(shape, dtype=torch.int64),
+            "action_log_prob": torch.zeros(shape),
+            "next": {"reward": torch.zeros(*shape, 1)},
+        },
+        batch_size=shape,
+    )
+    with pytest.raises(ValueError, match=r"The batch is empty: the reward .* has the shape"):
+        case.build(make_actor())(batch)
+
+
+def test_theorem_1_schedules_the_mode_seeking_loss_too():
+    """Whose tau is 0 at the first lift, while its tau' was 0 before."""
+    loss = CASES["pmd"].loss(make_actor())
+    temperatures = TemperatureScheduler(loss, **theorem1_schedules(10_000))
+    assert loss.tau.item() == 0
+    assert loss.tau_prime.item() > 0
+    temperatures.step()
+    assert loss.tau.item() > 0

@@ -46,6 +46,10 @@ class BanditEnv(EnvBase):
         tensor(True)
     """
 
+    rewards: Tensor
+    features: Tensor
+    _group: Tensor
+
     def __init__(
         self,
         *,
@@ -68,11 +72,13 @@ class BanditEnv(EnvBase):
                 raise ValueError(f"{name} must be at least 1, got {size}.")
         super().__init__(batch_size=torch.Size([num_groups, group_size]), device=device)
         generator = torch.Generator().manual_seed(instance_seed)
-        self.rewards = torch.rand(num_actions, generator=generator).pow(exponent).to(self.device)
-        self.features = torch.randn(num_actions, num_features, generator=generator).to(self.device)
+        rewards = torch.rand(num_actions, generator=generator).pow(exponent)
+        features = torch.randn(num_actions, num_features, generator=generator)
+        self.register_buffer("rewards", rewards.to(self.device))
+        self.register_buffer("features", features.to(self.device))
         # One problem instance, so a row's group stays the same from episode to episode.
         group = GroupIdAllocator().allocate(num_groups).to(self.device)
-        self._group = group.unsqueeze(-1).expand(self.batch_size)
+        self.register_buffer("_group", group.unsqueeze(-1).expand(self.batch_size).clone())
         self._make_specs(num_actions)
 
     def _make_specs(self, num_actions: int) -> None:

@@ -98,8 +98,8 @@ class Run:
 
     Args:
         config: the composed configuration; needs ``seed`` and ``logger`` with ``backend``
-            (``csv``: the record alone; ``tensorboard`` or ``wandb``: that too; ``none``: no
-            record), ``project`` and ``wandb_mode``.
+            (``csv``: the record alone; ``tensorboard`` or ``wandb``: that too; ``none``: not
+            not even the record), ``project`` and ``wandb_mode``.
 
     Keyword Args:
         total: number of steps of the run, for the progress bar.
@@ -124,7 +124,7 @@ class Run:
         plotted: Sequence[str],
         directory: Path | str = ".",
     ) -> None:
-        backend = config.logger.backend
+        backend = config.logger.backend or "none"
         if backend not in BACKENDS:
             raise ValueError(f"logger.backend must be one of {BACKENDS}, got {backend!r}.")
         self.name, self.unit, self.shown, self.plotted = name, unit, shown, plotted

@@ -66,6 +66,9 @@ class TrajectoryGroupLoss(LossModule):
     :meth:`surrogate`, and reduces and reports what comes back. A new member of the family
     implements that one method.
 
+    ``torch.compile(fullgraph=True)`` takes it with feed-forward actors; with recurrent ones PyTorch
+    and TorchRL break the graph.
+
     Real steps are those that :attr:`loss_mask_key` marks, by default TorchRL's own
     ``("collector", "mask")`` where it is present. A trajectory without a real step is left out of
     its group. Whatever stands in padded steps has no influence.
@@ -87,8 +90,9 @@ class TrajectoryGroupLoss(LossModule):
 
     Raises:
         ValueError: for an unknown reduction or a temperature that is not allowed; when called, for
-            a wrong shape, a group of one, a mask without a real step, a reward or recorded
-            log-probability that is not finite.
+            a wrong shape, a group of one, a mask without a real step, a reward or
+            log-probability that is not finite. (Under ``torch.compile`` values are not looked at,
+            only shapes: NaN then gives NaN, and a mask without a real step gives 0.)
         TypeError: if ``actor_network`` has no ``get_dist``.
         KeyError: when called, for a missing entry.
     """
@@ -145,15 +149,17 @@ class TrajectoryGroupLoss(LossModule):
             raise ValueError(f"reduction must be one of {REDUCTIONS} or None, got {reduction!r}.")
         self.reduction = reduction
         self.delay_actor = delay_actor
-        check_temperatures(allow_zero=self._may_be_zero, **temperatures)
-        for name, value in temperatures.items():
-            self.register_coeff_buffer(name, float(value))
+        values = {name: _as_float(name, value) for name, value in temperatures.items()}
+        check_temperatures(allow_zero=self._may_be_zero, **values)
+        for name, value in values.items():
+            self.register_coeff_buffer(name, value)
         self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Refuse a scheduled temperature that is not allowed, and keep the old one."""
         schedulable = type(self)._all_schedulable_buffers
-        if name in schedulable and isinstance(value, (int, float)):
+        if name in schedulable and name in self.__dict__.get("_buffers", {}):
+            value = _as_float(name, value)
             current = {other: getattr(self, other).item() for other in sorted(schedulable)}
             check_temperatures(allow_zero=self._may_be_zero, **{**current, name: value})
         super().__setattr__(name, value)  # pyright: ignore[reportArgumentType] - of TorchRL's base
@@ -456,6 +462,13 @@ class LiftProjectLoss(TrajectoryGroupLoss):
 # ------------------------------------------------------------------------------------- small parts
 
 
+def _as_float(name: str, value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError, RuntimeError):
+        raise ValueError(f"{name} must be a number, got {value!r}.") from None
+
+
 def _as_list(keys: NestedKey | list[NestedKey] | None) -> list[NestedKey]:
     return list(keys) if isinstance(keys, list) else [keys]  # type: ignore[list-item]
 
@@ -482,6 +495,10 @@ def _batch_shape(reward: Tensor, key: NestedKey) -> torch.Size:
         raise ValueError(
             f"The reward {key!r} must have the shape [*G, K, T, 1] (groups, K trajectories of one "
             f"problem instance, T steps), got {tuple(reward.shape)}."
+        )
+    if 0 in reward.shape:
+        raise ValueError(
+            f"The batch is empty: the reward {key!r} has the shape {tuple(reward.shape)}."
         )
     if reward.shape[-3] < 2:
         raise ValueError(
