@@ -159,8 +159,12 @@ def test_recurrent_policies_keep_their_state_while_rows_drop_out():
     collector.shutdown()
 
 
-def test_transforms_count_the_right_rows():
-    env = TransformedEnv(Countdown(3, 4), StepCounter())
+@pytest.mark.parametrize("declared", [False, True])
+def test_transforms_and_states_in_the_tensordict_follow_the_right_rows(declared):
+    env = Countdown(3, 4)
+    if declared:  # that `left` is also what a step reads
+        env.state_spec = Composite(left=env.observation_spec["left"].clone(), shape=(3, 4))
+    env = TransformedEnv(env, StepCounter())
     env.append_transform(RewardSum())
     collector = TrajectoryGroupCollector(
         env, linear_policy(2.0), num_groups=3, group_size=4, compact_obs=False

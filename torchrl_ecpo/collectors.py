@@ -203,8 +203,7 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
         if "done" not in env.done_keys:
             raise KeyError(f"The environment must have one 'done' a row, it has {env.done_keys}.")
         acted_on = (env.full_action_spec, env.full_state_spec)
-        seen = (env.full_observation_spec, env.full_done_spec)
-        self._env_keys = [key for spec in (*acted_on, *seen) for key in spec.keys(True, True)]
+        self._acted_on = [key for spec in acted_on for key in spec.keys(True, True)]
 
     def _setup_frames_per_batch(self, frames_per_batch: int) -> None:
         """Steps are not counted ahead: one at a time, in all rows."""
@@ -278,18 +277,20 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
         group = self._check_groups(root)
         rows = torch.arange(self.n_env, device=group.device)  # those that have not ended
         history: _History | None = None
-        waiting = root  # what the environment reads, in all rows
+        whole = root  # the last step of all rows, of which `root` holds those that have not ended
+        handed_on: set[NestedKey] = set()
         with set_exploration_type(self.exploration_type):
             for _ in range(self.max_steps):
                 if self._weight_updates != updates:
                     return None
                 root = self._act(root, rows)
-                handed_on = root.get("next", None)
-                root = self._step_env(root, waiting, rows)
                 if history is None:
-                    dropped = () if handed_on is None else handed_on.keys(True, True)
-                    dropped = self.exclude_keys.union(dropped)
+                    handed_on = set(root.get("next", TensorDict()).keys(True, True))
+                    whole = self.env.step(root)
+                    dropped = self.exclude_keys | handed_on
                     history = _History(_recorded_keys(root, dropped, self.compact_obs))
+                else:
+                    whole = self._step_env(root, whole, rows, handed_on)
                 history.append(root, rows)
                 done = root["next", "done"].reshape(-1)
                 following = self.env.step_mdp(root)
@@ -297,7 +298,6 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
                     if done.all():
                         return self._finish(history, group)
                     if len(rows) == self.n_env:
-                        waiting = root.select(*self._env_keys, strict=False).clone()
                         following = following.reshape(-1)
                     going_on = (~done).nonzero().squeeze(-1)
                     rows, following = rows[going_on], following[going_on]
@@ -327,22 +327,39 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
         cast = self._cast_to_policy_device and self.policy_device is not None
         seen = root.to(self.policy_device) if cast else root
         acted: Any = self._wrapped_policy(seen)
+        if acted is root:
+            return root
         return root.update(acted.to(root.device) if cast else acted)
 
     def _step_env(
-        self, root: TensorDictBase, waiting: TensorDictBase, rows: Tensor
+        self,
+        root: TensorDictBase,
+        whole: TensorDictBase,
+        rows: Tensor,
+        handed_on: Set[NestedKey],
     ) -> TensorDictBase:
-        """Step the active rows, which `root` holds; `waiting` has what the others stopped at."""
+        """Step the active rows, which `root` holds; `whole` is the last step of all rows.
+
+        What the policy hands to its own next step stays out of the environment. Returns the new
+        step of all rows, in which those that have ended act as they last did, to no effect.
+        """
         if len(rows) == self.n_env:
             return self.env.step(root)
         batch = self.env.batch_size
-        where = torch.unravel_index(rows, batch)
-        waiting[where] = root.select(*self._env_keys, strict=False)
-        active = torch.zeros(*batch, 1, dtype=torch.bool, device=rows.device)
-        active[where] = True
-        following = self.env.step(waiting.copy().set("_step", active)).get("next")[where]
-        # What the policy hands to its own next step prevails, as in a step of all rows.
-        return root.set("next", following.update(root.get("next", TensorDict())))
+        inputs = self.env.step_mdp(whole)
+        for key in self._acted_on:
+            acted = root.get(key, None)
+            if acted is not None and key not in handed_on:
+                before = whole.get(key)
+                after = before.flatten(0, len(batch) - 1).index_copy(0, rows, acted)
+                inputs.set(key, after.view_as(before))
+        active = torch.zeros(self.n_env, dtype=torch.bool, device=rows.device)
+        active[rows] = True
+        whole = self.env.step(inputs.set("_step", active.view(*batch, 1)))
+        following = whole.get("next").exclude(*handed_on).reshape(-1)[rows]
+        # What the policy hands on prevails, as in a step of all rows.
+        root.set("next", following.update(root.get("next", TensorDict())))
+        return whole
 
     def _finish(self, history: _History, group: Tensor) -> TensorDictBase:
         steps, row = history.by_row()

@@ -9,7 +9,14 @@ import hydra
 import torch
 from omegaconf import DictConfig
 from tasks import make_task
-from utils import check_config, make_collector, make_loss, make_temperatures, reached
+from utils import (
+    check_config,
+    make_collector,
+    make_loss,
+    make_optimizer,
+    make_temperatures,
+    reached,
+)
 
 from torchrl_ecpo.experiment import Run
 
@@ -24,7 +31,7 @@ def main(config: DictConfig) -> None:
     collector = make_collector(config, task)
     loss_module = make_loss(config.loss, task.actor)
     temperatures = make_temperatures(config.loss, loss_module)
-    optimizer = torch.optim.Adam(loss_module.parameters(), lr=config.optim.lr, eps=config.optim.eps)
+    optimizer = make_optimizer(config.optim, loss_module)
     max_grad_norm = config.optim.max_grad_norm or float("inf")
 
     groups_of_trajectories = iter(collector)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 from tasks import Metrics, Task
 from tensordict.nn import ProbabilisticTensorDictSequential
@@ -50,6 +51,13 @@ def make_loss(config: DictConfig, actor: ProbabilisticTensorDictSequential) -> T
     options = {str(k): v for k, v in config.items() if k not in ("name", *TEMPERATURES)}
     start = {name: make_schedule(value)(0) for name, value in _temperatures(config).items()}
     return LOSSES[config.name](actor, **start, **options)
+
+
+def make_optimizer(config: DictConfig, loss_module: TrajectoryGroupLoss) -> torch.optim.Optimizer:
+    """Adam over the parameters of the actor."""
+    return torch.optim.Adam(
+        loss_module.parameters(), lr=config.lr, eps=config.eps, amsgrad=config.amsgrad
+    )
 
 
 def make_temperatures(config: DictConfig, loss_module: TrajectoryGroupLoss) -> TemperatureScheduler:

@@ -42,8 +42,7 @@ class LinearSoftmax(nn.Module):
 class SharedCategorical(Distribution):
     """A categorical distribution that is the same in every row of the batch.
 
-    All that depends on the number of actions is computed once, not once a row: with 10,000 actions
-    and 100 rows that is most of the time of a training step.
+    All that depends on the number of actions is computed once, not once a row.
 
     Args:
         logits: ``[..., num_actions]``, all rows equal; only the first one is read.

@@ -1,0 +1,275 @@
+"""The ECPO training loop on Reverse, against the same loop in bare PyTorch without TensorDict.
+
+    python benchmarks/loop.py --levels 2 10 30
+
+One thread, one process; the loops take turns, each with its own environment and policy from the
+same seed. An iteration collects groups of 10 trajectories, 40 by default, computes ECPO's loss and
+steps Adam; every fifth copies the weights to the reference that acts. Figures are medians of
+processor time in milliseconds, which other processes disturb least.
+
+- ecpo: `TrajectoryGroupCollector`, `ECPOLoss`, Adam, as `sota-implementations/ecpo` puts them
+  together.
+- bare: the rules, the distribution, the LSTM over distinct histories and the loss's formula are the
+  package's, called on plain tensors by a loop written for this one case: no TensorDict, no
+  environment class, no keys, no checks, no diagnostics.
+- plain: the bare loop with PyTorch's `LSTMCell` and `LSTM` on every row.
+
+The policy is biased so that trajectories last, as those of a trained policy do: it seldom writes
+and mostly moves right. The learning rate is so small that it stays so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from copy import deepcopy
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.nn.utils import clip_grad_norm_
+from torch.nn.utils.rnn import pad_sequence
+from torchrl.envs import InitTracker, TransformedEnv
+from torchrl.modules import ProbabilisticActor
+
+from torchrl_ecpo import ECPOLoss
+from torchrl_ecpo.collectors import TrajectoryGroupCollector
+from torchrl_ecpo.envs import AlgorithmicEnv
+from torchrl_ecpo.functional import lifted_log_weights, mean_seeking_projection
+from torchrl_ecpo.modules import DistinctHistoryLSTM, TupleCategorical, make_tuple_policy
+
+GROUP_SIZE, PROJECT_STEPS = 10, 5
+NUM_OBSERVATIONS, NVEC = 3, (2, 2, 2)  # of Reverse
+NUM_CLASSES = (NUM_OBSERVATIONS, *(n + 1 for n in NVEC))
+TAU, TAU_PRIME, MAX_GRAD_NORM, LEARNING_RATE = 0.5, 0.01, 50.0, 1e-9
+
+Iteration = Callable[[], int]
+"""One iteration of a training loop; returns the number of steps that it collected."""
+
+
+def make_env(level: int, num_groups: int) -> AlgorithmicEnv:
+    return AlgorithmicEnv(
+        "reverse",
+        min_length=level,
+        curriculum=None,
+        num_groups=num_groups,
+        group_size=GROUP_SIZE,
+        seed=0,
+    )
+
+
+def make_actor(stray: float, write: float) -> ProbabilisticActor:
+    """A policy that moves left with probability `stray` and writes with probability `write`."""
+    torch.manual_seed(0)
+    actor = make_tuple_policy(NUM_OBSERVATIONS, NVEC)
+    readout = next(module for module in actor.modules() if isinstance(module, nn.Linear))
+    with torch.no_grad():
+        readout.bias.copy_(torch.tensor([stray, 1 - stray, 1 - write, write, 0.5, 0.5]).log())
+    return actor
+
+
+def ecpo_loop(level: int, num_groups: int, actor: ProbabilisticActor) -> Iteration:
+    """The package's loop, as the script has it."""
+    env = TransformedEnv(make_env(level, num_groups), InitTracker())
+    collector = TrajectoryGroupCollector(
+        env, actor, num_groups=num_groups, group_size=GROUP_SIZE, exclude_keys=["logits"]
+    )
+    loss_module = ECPOLoss(actor, tau=TAU, tau_prime=TAU_PRIME)
+    optimizer = torch.optim.Adam(loss_module.parameters(), lr=LEARNING_RATE)
+    batches = iter(collector)
+    iteration = 0
+
+    def iterate() -> int:
+        nonlocal iteration
+        if iteration % PROJECT_STEPS == 0:
+            collector.update_policy_weights_()
+        iteration += 1
+        groups = next(batches)
+        losses = loss_module(groups)
+        optimizer.zero_grad()
+        losses["loss_actor"].backward()
+        clip_grad_norm_(loss_module.parameters(), MAX_GRAD_NORM)
+        optimizer.step()
+        return int(groups["collector", "mask"].sum())
+
+    return iterate
+
+
+State = tuple[Tensor, Tensor]
+
+
+class Steps(NamedTuple):
+    """The steps of `N` trajectories, `[T, N]` and padded."""
+
+    symbol: Tensor
+    """Observation and previous action as one number."""
+    action: Tensor
+    log_prob: Tensor
+    reward: Tensor
+    mask: Tensor
+
+
+class DistinctNet:
+    """Logits from the LSTM over distinct histories, on plain tensors."""
+
+    def __init__(self, core: DistinctHistoryLSTM) -> None:
+        self.core = core
+
+    def step(self, symbol: Tensor, state: State | None) -> tuple[Tensor, State]:
+        """Logits and state `[n, *]` of one step; without a state, the first."""
+        starts = torch.full((1, len(symbol)), state is None)
+        nodes, *values = self.core._run(symbol.unsqueeze(0), starts, None, state)
+        logits, h, c = (value.index_select(0, nodes[0]) for value in values)
+        return logits, (h, c)
+
+    def unroll(self, steps: Steps) -> Tensor:
+        """Logits `[T, N, L]` of whole trajectories."""
+        starts = ~steps.mask
+        starts[0] = True
+        nodes, logits, *_ = self.core._run(steps.symbol, starts, steps.mask, None)
+        return logits.index_select(0, nodes.flatten()).view(*nodes.shape, -1)
+
+
+class PlainNet:
+    """Logits from PyTorch's LSTM on every row, with the same weights."""
+
+    def __init__(self, core: DistinctHistoryLSTM) -> None:
+        cell = core.cell
+        self.cell, self.readout = cell, core.readout
+        self.lstm = nn.LSTM(cell.input_size, cell.hidden_size)
+        self.lstm.weight_ih_l0, self.lstm.weight_hh_l0 = cell.weight_ih, cell.weight_hh
+        self.lstm.bias_ih_l0, self.lstm.bias_hh_l0 = cell.bias_ih, cell.bias_hh
+        every = torch.cartesian_prod(*map(torch.arange, NUM_CLASSES)).unbind(1)
+        hots = [F.one_hot(x, n) for x, n in zip(every, NUM_CLASSES, strict=True)]
+        self.one_hot = torch.cat(hots, -1).float()
+
+    def step(self, symbol: Tensor, state: State | None) -> tuple[Tensor, State]:
+        """Logits and state `[n, *]` of one step; without a state, the first."""
+        h, c = self.cell(self.one_hot.index_select(0, symbol), state)
+        return self.readout(h), (h, c)
+
+    def unroll(self, steps: Steps) -> Tensor:
+        """Logits `[T, N, L]` of whole trajectories."""
+        return self.readout(self.lstm(self.one_hot[steps.symbol])[0])
+
+
+def collect(env: AlgorithmicEnv, net: DistinctNet | PlainNet, weights: Tensor) -> Steps:
+    """Play every trajectory to its end; rows that have ended are dropped."""
+    rows = env._every_row
+    env._queue.clear()
+    env._start(rows)
+    played: list[tuple[Tensor, ...]] = []
+    state: State | None = None
+    while len(rows):
+        inputs = torch.cat([env._observation[rows].unsqueeze(1), env._previous_action[rows]], 1)
+        symbol = (inputs * weights).sum(1)
+        logits, state = net.step(symbol, state)
+        distribution = TupleCategorical(logits, NVEC, validate_args=False)
+        action = distribution.sample()
+        log_prob = distribution.log_prob(action)
+        reward = env._advance(rows, action)
+        played.append((rows, symbol, action, log_prob, reward))
+        ended = env._ended[rows]
+        if ended.any():
+            going_on = (~ended).nonzero().squeeze(1)
+            h, c = state
+            rows = rows[going_on]
+            state = h.index_select(0, going_on), c.index_select(0, going_on)
+    row, *values = (torch.cat(column) for column in zip(*played, strict=True))
+    order = row.argsort(stable=True)
+    lengths = row.bincount().tolist()
+    symbol, action, log_prob, reward = (
+        pad_sequence(list(value[order].split(lengths))) for value in values
+    )
+    mask = torch.arange(max(lengths)).unsqueeze(1) < torch.tensor(lengths)
+    return Steps(symbol, action, log_prob, reward, mask)
+
+
+def bare_loop(
+    level: int,
+    num_groups: int,
+    actor: ProbabilisticActor,
+    make_net: type[DistinctNet] | type[PlainNet],
+) -> Iteration:
+    """The loop on plain tensors."""
+    env = make_env(level, num_groups)
+    core = next(module for module in actor.modules() if isinstance(module, DistinctHistoryLSTM))
+    reference = deepcopy(core)
+    net, reference_net = make_net(core), make_net(reference)
+    optimizer = torch.optim.Adam(core.parameters(), lr=LEARNING_RATE)
+    sizes = torch.tensor(NUM_CLASSES)
+    weights = sizes.flip(0).cumprod(0).flip(0) // sizes
+    iteration = 0
+
+    def iterate() -> int:
+        nonlocal iteration
+        if iteration % PROJECT_STEPS == 0:
+            reference.load_state_dict(core.state_dict())
+        iteration += 1
+        with torch.no_grad():
+            steps = collect(env, reference_net, weights)
+        distribution = TupleCategorical(net.unroll(steps), NVEC, validate_args=False)
+        log_prob = distribution.log_prob(steps.action).where(steps.mask, 0.0)
+        log_prob, reference_log_prob, returns = (
+            values.sum(0).view(num_groups, GROUP_SIZE)
+            for values in (log_prob, steps.log_prob, steps.reward)
+        )
+        lift = lifted_log_weights(returns, reference_log_prob, tau=TAU, tau_prime=TAU_PRIME)
+        loss, _ = mean_seeking_projection(log_prob, lift)
+        optimizer.zero_grad()
+        loss.mean().backward()
+        clip_grad_norm_(core.parameters(), MAX_GRAD_NORM)
+        optimizer.step()
+        return int(steps.mask.sum())
+
+    return iterate
+
+
+def take_turns(loops: list[Iteration], repeats: int) -> tuple[list[float], ...]:
+    """Median processor and wall-clock times in milliseconds, and steps, of an iteration of each."""
+    figures: list[list[tuple[float, float, int]]] = [[] for _ in loops]
+    for repeat in range(repeats + 2):
+        for iterate, seen in zip(loops, figures, strict=True):
+            processor, wall = time.process_time(), time.perf_counter()
+            steps = iterate()
+            times = time.process_time() - processor, time.perf_counter() - wall
+            if repeat > 1:
+                seen.append((1e3 * times[0], 1e3 * times[1], steps))
+    medians = [
+        [statistics.median(column) for column in zip(*seen, strict=True)] for seen in figures
+    ]
+    processor, wall, steps = (list(column) for column in zip(*medians, strict=True))
+    return processor, wall, steps
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--levels", type=int, nargs="+", default=[2, 10, 30])
+    parser.add_argument("--groups", type=int, default=40)
+    parser.add_argument("--stray", type=float, default=0.02)
+    parser.add_argument("--write", type=float, default=0.002)
+    parser.add_argument("--repeats", type=int, default=10)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    print("ms an iteration: processor (wall clock); ratios of processor time")
+    print("level  steps |      ecpo     |      bare     |     plain     | bare/ecpo  plain/ecpo")
+    for level in arguments.levels:
+        actors = [make_actor(arguments.stray, arguments.write) for _ in range(3)]
+        loops = [
+            ecpo_loop(level, arguments.groups, actors[0]),
+            bare_loop(level, arguments.groups, actors[1], DistinctNet),
+            bare_loop(level, arguments.groups, actors[2], PlainNet),
+        ]
+        processor, wall, steps = take_turns(loops, arguments.repeats)
+        cells = [f"{level:5d} {steps[0]:6.0f}"]
+        cells += [f"{x:5.0f} ({y:5.0f})" for x, y in zip(processor, wall, strict=True)]
+        ecpo, bare, plain = processor
+        cells.append(f"{bare / ecpo:9.2f}  {plain / ecpo:10.2f}")
+        print(" | ".join(cells), flush=True)
+
+
+if __name__ == "__main__":
+    main()
