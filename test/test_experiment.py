@@ -28,7 +28,6 @@ def make_run(directory, config=None):
         unit="trajectories",
         name="bandit/ecpo/seed_3",
         shown=("return", "evaluation"),
-        plotted=("return", "evaluation"),
         directory=directory,
     )
 

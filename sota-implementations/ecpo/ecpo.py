@@ -43,7 +43,6 @@ def main(config: DictConfig) -> None:
         unit="trajectories",
         name=f"{config.env.name}/{config.loss.name}/seed_{config.seed}",
         shown=task.shown,
-        plotted=task.shown,
     ) as run:
         while trajectories < config.total_trajectories:
             # Lift: the current policy becomes the reference.

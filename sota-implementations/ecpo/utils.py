@@ -47,10 +47,9 @@ def make_collector(config: DictConfig, task: Task) -> TrajectoryGroupCollector:
 
 
 def make_loss(config: DictConfig, actor: ProbabilisticTensorDictSequential) -> TrajectoryGroupLoss:
-    """The loss that ``loss=`` names; its temperatures are those at the start."""
+    """The loss that ``loss=`` names; ``make_temperatures`` sets its temperatures."""
     options = {str(k): v for k, v in config.items() if k not in ("name", *TEMPERATURES)}
-    start = {name: make_schedule(value)(0) for name, value in _temperatures(config).items()}
-    return LOSSES[config.name](actor, **start, **options)
+    return LOSSES[config.name](actor, **options)
 
 
 def make_optimizer(config: DictConfig, loss_module: TrajectoryGroupLoss) -> torch.optim.Optimizer:
@@ -61,8 +60,10 @@ def make_optimizer(config: DictConfig, loss_module: TrajectoryGroupLoss) -> torc
 
 
 def make_temperatures(config: DictConfig, loss_module: TrajectoryGroupLoss) -> TemperatureScheduler:
-    """Schedules of the temperatures, counted in trajectories."""
-    schedules = {name: make_schedule(value) for name, value in _temperatures(config).items()}
+    """Schedules of the temperatures, counted in trajectories; they begin at once."""
+    settings = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(settings, dict)
+    schedules = {name: make_schedule(settings[name]) for name in TEMPERATURES if name in settings}
     return TemperatureScheduler(loss_module, **schedules)
 
 
@@ -73,10 +74,3 @@ def reached(goal: DictConfig | None, metrics: Metrics) -> bool:
     if goal.metric not in metrics:
         raise KeyError(f"anneal_from.metric must be one of {sorted(metrics)}, got {goal.metric!r}.")
     return bool(metrics[goal.metric] >= goal.at_least)
-
-
-def _temperatures(config: DictConfig) -> dict[str, float | dict]:
-    """By name, a number or a schedule, as ``make_schedule`` takes them."""
-    values = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(values, dict)
-    return {name: values[name] for name in TEMPERATURES if name in values}

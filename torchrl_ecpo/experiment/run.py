@@ -99,14 +99,13 @@ class Run:
     Args:
         config: the composed configuration; needs ``seed`` and ``logger`` with ``backend``
             (``csv``: the record alone; ``tensorboard`` or ``wandb``: that too; ``none``: not
-            not even the record), ``project`` and ``wandb_mode``.
+            even the record), ``project`` and ``wandb_mode``.
 
     Keyword Args:
         total: number of steps of the run, for the progress bar.
         unit: what a step is, for the bar and the picture's axis.
         name: of the run, in titles and loggers.
-        shown: metrics that the progress bar shows.
-        plotted: metrics that the picture shows, a panel each.
+        shown: metrics that the progress bar shows, and the picture, a panel each.
         directory: where to write; defaults to the working directory.
 
     Raises:
@@ -121,13 +120,12 @@ class Run:
         unit: str,
         name: str,
         shown: Sequence[str],
-        plotted: Sequence[str],
         directory: Path | str = ".",
     ) -> None:
         backend = config.logger.backend or "none"
         if backend not in BACKENDS:
             raise ValueError(f"logger.backend must be one of {BACKENDS}, got {backend!r}.")
-        self.name, self.unit, self.shown, self.plotted = name, unit, shown, plotted
+        self.name, self.unit, self.shown = name, unit, shown
         self.directory = Path(directory).resolve()
         self.step = 0
         self._latest: dict[str, float] = {}
@@ -206,7 +204,7 @@ class Run:
         picture = plot_learning_curve(
             self.table.rows,
             self.directory / "curve.png",
-            metrics=self.plotted,
+            metrics=self.shown,
             title=self.name,
             x_label=self.unit,
         )
