@@ -19,6 +19,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from csv_table import add_csv_option, write_csv
 from gymnasium.spaces import Discrete, MultiDiscrete
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, GymWrapper, SerialEnv
@@ -100,6 +101,7 @@ def main() -> None:
     parser.add_argument("--min-length", type=int, default=10)
     parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--repeats", type=int, default=7)
+    add_csv_option(parser)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)
@@ -124,6 +126,17 @@ def main() -> None:
     print(f"{'':32} {'steps/s':>9}  {'batched is':>10}")
     for name, taken in medians.items():
         print(f"{name:32} {1 / taken:9,.0f}  {taken / fastest:9.1f}x")
+    write_csv(
+        arguments.csv,
+        [
+            {
+                "environment": name,
+                "steps_per_second": round(1 / taken),
+                "batched_is_times_as_fast": taken / fastest,
+            }
+            for name, taken in medians.items()
+        ],
+    )
 
 
 if __name__ == "__main__":

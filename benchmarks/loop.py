@@ -1,6 +1,7 @@
 """The ECPO training loop on Reverse, against the same loop in bare PyTorch without TensorDict.
 
     python benchmarks/loop.py --levels 2 10 30
+    python benchmarks/loop.py --profile --levels 10
 
 One thread, one process; the loops take turns, each with its own environment and policy from the
 same seed. An iteration collects groups of 10 trajectories, 40 by default, computes ECPO's loss and
@@ -14,6 +15,8 @@ processor time in milliseconds, which other processes disturb least.
   environment class, no keys, no checks, no diagnostics.
 - plain: the bare loop with PyTorch's `LSTMCell` and `LSTM` on every row.
 
+`--profile` tells instead what a step of collecting is made of, in microseconds.
+
 The policy is biased so that trajectories last, as those of a trained policy do: it seldom writes
 and mostly moves right. The learning rate is so small that it stays so.
 """
@@ -22,17 +25,20 @@ from __future__ import annotations
 
 import argparse
 import statistics
+import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable
 from copy import deepcopy
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
+from csv_table import add_csv_option, write_csv
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils import clip_grad_norm_
 from torch.nn.utils.rnn import pad_sequence
-from torchrl.envs import InitTracker, TransformedEnv
+from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor
 
 from torchrl_ecpo import ECPOLoss
@@ -73,7 +79,7 @@ def make_actor(stray: float, write: float) -> ProbabilisticActor:
 
 def ecpo_loop(level: int, num_groups: int, actor: ProbabilisticActor) -> Iteration:
     """The package's loop, as the script has it."""
-    env = TransformedEnv(make_env(level, num_groups), InitTracker())
+    env = make_env(level, num_groups)
     collector = TrajectoryGroupCollector(
         env, actor, num_groups=num_groups, group_size=GROUP_SIZE, exclude_keys=["logits"]
     )
@@ -245,6 +251,98 @@ def take_turns(loops: list[Iteration], repeats: int) -> tuple[list[float], ...]:
     return processor, wall, steps
 
 
+# What is timed in a step of collecting. The rest of a part is what is left of the whole one.
+TIMED: dict[str, list[tuple[Any, str]]] = {
+    "collecting": [(TrajectoryGroupCollector, "rollout"), (sys.modules[__name__], "collect")],
+    "policy": [(TrajectoryGroupCollector, "_act")],
+    "LSTM": [(DistinctHistoryLSTM, "_run")],
+    "distribution": [
+        (TupleCategorical, name) for name in ("sample", "log_prob", "sample_and_log_prob")
+    ],
+    "env.step": [(EnvBase, "step")],
+    "rules": [(AlgorithmicEnv, "_advance")],
+    "new instances": [(AlgorithmicEnv, "_start")],
+}
+
+
+class Timers:
+    """Processor time spent in the functions of `TIMED` while nothing records gradients."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.running: set[str] = set()
+        for part, functions in TIMED.items():
+            for owner, name in functions:
+                if hasattr(owner, name):
+                    setattr(owner, name, self.time(part, getattr(owner, name)))
+
+    def time(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, timed unless it is called by another one of the same part."""
+
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            is_update = torch.is_grad_enabled() and part != "collecting"
+            if is_update or part in self.running:
+                return function(*args, **kwargs)
+            self.running.add(part)
+            start = time.process_time()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self.seconds[part] += time.process_time() - start
+                self.running.remove(part)
+
+        return timed
+
+
+def profile(loops: list[Iteration], repeats: int, num_steps: int) -> list[dict[str, float]]:
+    """Median microseconds of the parts of a step of collecting, of each loop."""
+    timers = Timers()
+    seen: list[dict[str, list[float]]] = [{part: [] for part in TIMED} for _ in loops]
+    for repeat in range(repeats + 2):
+        for iterate, times in zip(loops, seen, strict=True):
+            timers.seconds.clear()
+            iterate()
+            if repeat > 1:
+                for part in TIMED:
+                    times[part].append(1e6 * timers.seconds[part] / num_steps)
+    return [split({part: statistics.median(xs) for part, xs in times.items()}) for times in seen]
+
+
+def split(times: dict[str, float]) -> dict[str, float]:
+    """Parts that add up."""
+    inner = times["LSTM"] + times["distribution"]
+    step = max(times["env.step"], times["rules"])
+    policy = max(times["policy"], inner)
+    return {
+        "LSTM over distinct histories": times["LSTM"],
+        "distribution": times["distribution"],
+        "rest of the policy": policy - inner,
+        "rules of the task": times["rules"],
+        "rest of env.step": step - times["rules"],
+        "new instances": times["new instances"],
+        "everything else": times["collecting"] - policy - step - times["new instances"],
+        "all": times["collecting"],
+    }
+
+
+def print_profile(arguments: argparse.Namespace) -> None:
+    level = arguments.levels[0]
+    actors = [make_actor(arguments.stray, arguments.write) for _ in range(2)]
+    loops = [
+        ecpo_loop(level, arguments.groups, actors[0]),
+        bare_loop(level, arguments.groups, actors[1], DistinctNet),
+    ]
+    # Right moves only, and nothing written: the longest instance's time limit.
+    ecpo, bare = profile(loops, arguments.repeats, num_steps=2 * (level + 2) + 5)
+    print(f"us a step of collecting, level {level}     ecpo   bare")
+    for part in ecpo:
+        print(f"{part:38} {ecpo[part]:7.0f} {bare[part]:6.0f}")
+    rows = [
+        {"part": part, "ecpo_us": round(ecpo[part]), "bare_us": round(bare[part])} for part in ecpo
+    ]
+    write_csv(arguments.csv, rows)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--levels", type=int, nargs="+", default=[2, 10, 30])
@@ -252,10 +350,16 @@ def main() -> None:
     parser.add_argument("--stray", type=float, default=0.02)
     parser.add_argument("--write", type=float, default=0.002)
     parser.add_argument("--repeats", type=int, default=10)
+    parser.add_argument("--profile", action="store_true", help="of a step, at the first level")
+    add_csv_option(parser)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    if arguments.profile:
+        print_profile(arguments)
+        return
     print("ms an iteration: processor (wall clock); ratios of processor time")
     print("level  steps |      ecpo     |      bare     |     plain     | bare/ecpo  plain/ecpo")
+    table = []
     for level in arguments.levels:
         actors = [make_actor(arguments.stray, arguments.write) for _ in range(3)]
         loops = [
@@ -269,6 +373,12 @@ def main() -> None:
         ecpo, bare, plain = processor
         cells.append(f"{bare / ecpo:9.2f}  {plain / ecpo:10.2f}")
         print(" | ".join(cells), flush=True)
+        row = {"level": level, "groups": arguments.groups, "stray": arguments.stray}
+        row |= {"steps": round(steps[0])}
+        for name, x, y in zip(("ecpo", "bare", "plain"), processor, wall, strict=True):
+            row |= {f"{name}_ms": x, f"{name}_wall_ms": y}
+        table.append(row | {"bare_over_ecpo": bare / ecpo, "plain_over_ecpo": plain / ecpo})
+    write_csv(arguments.csv, table)
 
 
 if __name__ == "__main__":

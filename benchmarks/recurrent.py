@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable
 
 import torch
+from csv_table import add_csv_option, write_csv
 from tensordict import TensorDict
 from torchrl.modules import ProbabilisticActor, set_recurrent_mode
 
@@ -94,6 +95,7 @@ def main() -> None:
     parser.add_argument("--rollouts", type=int, default=10)
     parser.add_argument("--hidden-size", type=int, default=128)
     parser.add_argument("--repeats", type=int, default=5)
+    add_csv_option(parser)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)
@@ -112,6 +114,7 @@ def main() -> None:
     rows = arguments.groups * arguments.rollouts
     print(f"{rows} rows, hidden size {arguments.hidden_size}; plain / distinct, ms")
     print("steps  branch  share |       sample        ratio |       update        ratio | both")
+    table = []
     for steps in arguments.steps:
         for branch in arguments.branch:
             data = make_histories(arguments.groups, arguments.rollouts, steps, branch)
@@ -124,6 +127,12 @@ def main() -> None:
                 cells.append(f"{plain:8.1f} / {distinct:6.1f}  {plain / distinct:5.1f}x")
             both = (sampling[0] + updating[0]) / (sampling[1] + updating[1])
             print(" | ".join([*cells, f"{both:.1f}x"]), flush=True)
+            row = {"steps": steps, "branch": branch, "share": share}
+            for name, times in (("sample", sampling), ("update", updating)):
+                row |= {f"{name}_plain_ms": times[0], f"{name}_distinct_ms": times[1]}
+                row |= {f"{name}_ratio": times[0] / times[1]}
+            table.append(row | {"both_ratio": both})
+    write_csv(arguments.csv, table)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from statistics import median
 
 import torch
+from csv_table import add_csv_option, write_csv
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
@@ -77,15 +78,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sizes", type=float, nargs="+", default=[1e4, 3e4, 1e5, 3e5, 1e6])
     parser.add_argument("--repeats", type=int, default=100)
+    add_csv_option(parser)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)
     print(f"{NUM_GROUPS} groups of {GROUP_SIZE} trajectories a draw and a write, one thread")
     columns = ("steps", "write ms", "draw ms", "sample ms", "draw MB", "tables MB")
     print("".join(f"{column:>11}" for column in columns))
+    table = []
     for size in map(int, arguments.sizes):
         figures = measure(size, arguments.repeats)
         print(f"{size:>11,}" + "".join(f"{figure:>11.2f}" for figure in figures))
+        names = (column.replace(" ", "_") for column in columns)
+        table.append(dict(zip(names, (size, *figures), strict=True)))
+    write_csv(arguments.csv, table)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from torchrl.data import (
     Unbounded,
 )
 from torchrl.envs import EnvBase, InitTracker, RewardSum, StepCounter, TransformedEnv
-from torchrl.modules import LSTMModule, RandomPolicy
+from torchrl.modules import LSTMModule, RandomPolicy, get_env_transforms_from_module
 
 from torchrl_ecpo.collectors import TrajectoryGroupCollector
 from torchrl_ecpo.data import TrajectoryGroupSampler, pack_groups, unpack_groups
@@ -157,6 +157,63 @@ def test_recurrent_policies_keep_their_state_while_rows_drop_out():
     assert_close(batch["action"][mask], action[mask])
     assert (batch["is_init"].squeeze(-1) == (torch.arange(batch.shape[-1]) == 0))[mask].all()
     collector.shutdown()
+
+
+def test_recurrent_policies_need_no_transforms():
+    """What the collector appends by itself acts at resets alone, and makes no difference."""
+    policy = recurrent_policy()
+    transformed = TransformedEnv(Countdown(3, 4), get_env_transforms_from_module(policy))
+    plain = Countdown(3, 4)
+    steps = []
+    tracker_step = InitTracker._call
+    batches = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(InitTracker, "_call", lambda *args: steps.append(None) or tracker_step(*args))
+        for env in (transformed, plain):
+            steps.clear()
+            collector = TrajectoryGroupCollector(env, policy, num_groups=6, group_size=4)
+            batches.append(next(iter(collector)).exclude("group"))
+            assert bool(steps) == (env is transformed)
+    assert_td_close(*batches)
+    first = torch.arange(batches[1].shape[-1]) == 0
+    mask = batches[1]["collector", "mask"]
+    assert (batches[1]["is_init"].squeeze(-1) == first)[mask].all()
+
+
+def test_registration_of_transforms_can_be_refused():
+    collector = TrajectoryGroupCollector(
+        Countdown(), linear_policy(), num_groups=2, group_size=3,
+        auto_register_policy_transforms=False,
+    )  # fmt: skip
+    assert "is_init" not in set(next(iter(collector)).keys())
+
+
+def count_steps(data):
+    """A policy that names no keys, and that remembers in an entry of its own."""
+    count = data.get("count", torch.zeros(*data.shape, 1)) + 1
+    return data.set("count", count).set("action", count + data["observation"][..., :1])
+
+
+def test_policies_may_keep_entries_of_their_own():
+    collector = TrajectoryGroupCollector(
+        Countdown(3, 4), count_steps, num_groups=6, group_size=4, trust_policy=True
+    )
+    batch = next(iter(collector))
+    check_batch(batch, 6, 4)
+    mask = batch["collector", "mask"]
+    time = torch.arange(batch.shape[-1]).expand(mask.shape)
+    assert mask.sum(-1).unique().numel() > 3
+    assert (batch["count"].squeeze(-1) == time + 1)[mask].all()
+    assert_close(batch["next", "reward"], batch["count"] + batch["left"])
+
+
+def test_what_a_policy_overwrites_is_what_it_acted_on():
+    double = TensorDictModule(lambda x: 2 * x, ["observation"], ["observation"])
+    policy = TensorDictSequential(double, linear_policy(1.0))
+    batch = next(iter(TrajectoryGroupCollector(Countdown(), policy, num_groups=2, group_size=3)))
+    mask = batch["collector", "mask"]
+    assert (batch["observation"][..., 0] == 2 * batch["left"][..., 0])[mask].all()
+    assert (batch["action"] == 2.0)[mask].all()
 
 
 @pytest.mark.parametrize("declared", [False, True])
@@ -431,7 +488,7 @@ def test_worker_processes(sync):
     finally:
         restarted = collector.restarted_trajectories
         collector.shutdown()
-    assert 250 <= frames < 300
+    assert 250 <= frames < 250 + (4 if sync else 2) * 3 * 6  # a batch's groups, copies and steps
     assert len(set(groups)) == len(groups)
     if sync:
         assert restarted == 0

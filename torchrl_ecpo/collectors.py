@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence, Set
 from copy import deepcopy
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -20,7 +21,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import RandomPolicy
 
-from torchrl_ecpo.data import GROUP_KEY, TRAJECTORY_KEY, pack_groups
+from torchrl_ecpo.data import GROUP_KEY, MASK_KEY, TRAJECTORY_KEY, pack_groups, unpack_groups
 
 __all__ = ["TrajectoryGroupCollector"]
 
@@ -85,7 +86,10 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
       when :meth:`update_policy_weights_` is called, on every backend. If that happens within a
       batch, its trajectories are restarted, and counted in :attr:`restarted_trajectories`;
     - spends nothing on trajectories that have ended: the policy sees the rows of the others, and
-      the environment gets ``"_step"``. Nothing runs across batches, so nothing is thrown away.
+      the environment gets ``"_step"``. Nothing runs across batches, so nothing is thrown away;
+    - sees to what a recurrent policy needs: the environment may lack `InitTracker` and primers.
+      What the collector adds for the policy acts at a reset only; ``is_init`` and what the policy
+      hands to its own next step then travel without passing through the environment.
 
     A batch keeps what the environment and the policy wrote at each step, with two exceptions. What
     the policy hands to its own next step, ``("next", ...)`` such as the state of an LSTM, is left
@@ -177,6 +181,7 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
             self.total_frames = total_frames
         try:
             self._check_env()
+            self._prepare_steps()
         except Exception:
             self.shutdown(raise_on_error=False)
             raise
@@ -202,8 +207,34 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
             )
         if "done" not in env.done_keys:
             raise KeyError(f"The environment must have one 'done' a row, it has {env.done_keys}.")
+
+    def _maybe_setup_policy_env_transforms(self, env: EnvBase, policy: Any) -> EnvBase:
+        """Append what the policy needs, an `InitTracker` and its primers, for resets alone.
+
+        In a step they would cost as much as all else around the rules of a fast environment.
+        """
+        self._stepped_env = env
+        self._reset_env = super()._maybe_setup_policy_env_transforms(env, policy)
+        return self._reset_env
+
+    def _prepare_steps(self) -> None:
+        """Find the environment to step, and what it and the policy read and write."""
+        if self.env is not self._reset_env:  # more was appended, such as a StepCounter
+            self._stepped_env = self.env
+        env, policy = self._stepped_env, self._wrapped_policy_uncompiled
         acted_on = (env.full_action_spec, env.full_state_spec)
         self._acted_on = [key for spec in acted_on for key in spec.keys(True, True)]
+        own = env.full_observation_spec.keys(True, True)
+        self._start_keys = [
+            key
+            for key in self.env.full_observation_spec.keys(True, True)
+            if key not in own and (key if isinstance(key, str) else key[-1]) == "is_init"
+        ]
+        read = [] if isinstance(policy, RandomPolicy) else getattr(policy, "in_keys", None)
+        self._read = None if read is None else [unravel_key(key) for key in read]
+        written = getattr(policy, "out_keys", env.action_keys)
+        self._written = [unravel_key(key) for key in written]
+        self._flow: _Flow | None = None
 
     def _setup_frames_per_batch(self, frames_per_batch: int) -> None:
         """Steps are not counted ahead: one at a time, in all rows."""
@@ -225,9 +256,9 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
         """Yield batches, or None after each that is written to the replay buffer."""
         while self._frames < self.total_frames:
             self._iter += 1
-            steps = self.rollout()
-            self._increment_frames(steps.numel())
-            batch = self._postproc(self._format(steps))
+            groups = self.rollout()
+            self._increment_frames(int(groups[MASK_KEY].sum()))
+            batch = self._postproc(unpack_groups(groups) if self._yield_flat else groups)
             if self.post_collect_hook is not None:
                 self.post_collect_hook(batch)
             if self.replay_buffer is None:
@@ -237,74 +268,68 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
             self.replay_buffer.extend(batch)
             yield None
 
-    def _format(self, steps: TensorDictBase) -> TensorDictBase:
-        if self._yield_flat:
-            return steps
-        return pack_groups(steps, group_size=self.group_size, group_key=self.group_key)
-
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:
-        """Collect the steps `[S]` of a batch, trajectory after trajectory, group after group."""
+        """Collect a batch of groups `[G, K, T]`."""
         if self.pre_collect_hook is not None:
             self.pre_collect_hook()
         while True:
-            updates, weights = self._weight_updates, self._copy_weights()
-            rounds: list[TensorDictBase | None] = []
+            updates = self._weight_updates
+            weights = [weight.detach().clone() for weight in self._weights()]
+            rounds: list[_Round | None] = []
             while len(rounds) * self.n_env < self.num_groups * self.group_size:
                 rounds.append(self._play_round(updates))
                 if rounds[-1] is None:
                     break
+            played = [one for one in rounds if one is not None]
             # A worker's weights are written by another thread: the count of updates may come late.
-            if rounds[-1] is not None and self._has_weights(weights):
-                batch: Any = TensorDict.cat(rounds)
-                return batch
+            if len(played) == len(rounds) and self._has_weights(weights):
+                return self._pack(played)
             self._restarted += len(rounds) * self.n_env
 
-    def _copy_weights(self) -> list[Tensor]:
+    def _weights(self) -> Iterator[nn.Parameter]:
         module = self.policy if isinstance(self.policy, nn.Module) else nn.Module()
-        return [parameter.detach().clone() for parameter in module.parameters()]
+        return module.parameters()
 
     def _has_weights(self, weights: list[Tensor]) -> bool:
-        now = self._copy_weights()
         return all(
-            torch.allclose(new, old, rtol=0.0, atol=0.0, equal_nan=True)
-            for new, old in zip(now, weights, strict=True)
+            torch.equal(new, old) or torch.allclose(new, old, rtol=0.0, atol=0.0, equal_nan=True)
+            for new, old in zip(self._weights(), weights, strict=True)
         )
 
-    def _play_round(self, updates: int) -> TensorDictBase | None:
+    def _play_round(self, updates: int) -> _Round | None:
         """Play one trajectory in each row; None if the weights were updated meanwhile."""
         root = self.env.reset()
-        group = self._check_groups(root)
-        rows = torch.arange(self.n_env, device=group.device)  # those that have not ended
-        history: _History | None = None
-        whole = root  # the last step of all rows, of which `root` holds those that have not ended
-        handed_on: set[NestedKey] = set()
+        played = _Round(self._check_groups(root))
+        seen = root.copy() if self._read is None else root.select(*self._read, strict=False)
+        rows = torch.arange(self.n_env, device=played.group.device)  # those that have not ended
+        active: _Active | None = None
         with set_exploration_type(self.exploration_type):
             for _ in range(self.max_steps):
                 if self._weight_updates != updates:
                     return None
-                root = self._act(root, rows)
-                if history is None:
-                    handed_on = set(root.get("next", TensorDict()).keys(True, True))
-                    whole = self.env.step(root)
-                    dropped = self.exclude_keys | handed_on
-                    history = _History(_recorded_keys(root, dropped, self.compact_obs))
+                acted = self._act(seen, rows)
+                step = self._stepped_env.step(self._set_inputs(root, acted, active))
+                if self._flow is None:
+                    self._flow = self._trace_flow(step, acted)
+                played.append(step, acted, rows, self._flow)
+                done = step.get(("next", "done")).reshape(-1).index_select(0, rows)
+                going_on = done.logical_not_().nonzero().squeeze(-1)
+                if not len(going_on):
+                    return played
+                root = self._stepped_env.step_mdp(step)
+                if len(played) == 1:
+                    root.update({key: torch.zeros_like(root[key]) for key in self._start_keys})
+                if len(going_on) == len(rows):
+                    going_on = None
                 else:
-                    whole = self._step_env(root, whole, rows, handed_on)
-                history.append(root, rows)
-                done = root["next", "done"].reshape(-1)
-                following = self.env.step_mdp(root)
-                if done.any():
-                    if done.all():
-                        return self._finish(history, group)
-                    if len(rows) == self.n_env:
-                        following = following.reshape(-1)
-                    going_on = (~done).nonzero().squeeze(-1)
-                    rows, following = rows[going_on], following[going_on]
-                root = following
+                    rows = rows.index_select(0, going_on)
+                    active = _Active(rows, self.n_env)
+                seen = _show(root, acted, rows, going_on, self._flow)
         raise RuntimeError(
-            f"{len(rows)} trajectories, the first one of group {int(group.reshape(-1)[rows[0]])}, "
-            f"have not ended after max_steps={self.max_steps} steps. Limit their length: append "
+            f"{len(rows)} trajectories, the first one of group "
+            f"{int(played.group.reshape(-1)[rows[0]])}, have not ended after "
+            f"max_steps={self.max_steps} steps. Limit their length: append "
             "StepCounter(max_steps=...) to the environment, or pass max_frames_per_traj."
         )
 
@@ -319,54 +344,64 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
             )
         return group
 
-    def _act(self, root: TensorDictBase, rows: Tensor) -> TensorDictBase:
-        """Let the policy act in `root`, which holds the active rows."""
+    def _act(self, seen: TensorDictBase, rows: Tensor) -> TensorDictBase:
+        """Let the policy act on what it sees of the active rows."""
         if isinstance(self.policy, RandomPolicy):
-            action = self.policy(TensorDict(batch_size=self.env.batch_size, device=root.device))
-            return root.update(action if len(rows) == self.n_env else action.reshape(-1)[rows])
+            action = self.policy(TensorDict(batch_size=self.env.batch_size, device=seen.device))
+            return seen.update(action if len(rows) == self.n_env else action.reshape(-1)[rows])
         cast = self._cast_to_policy_device and self.policy_device is not None
-        seen = root.to(self.policy_device) if cast else root
-        acted: Any = self._wrapped_policy(seen)
-        if acted is root:
-            return root
-        return root.update(acted.to(root.device) if cast else acted)
+        acted: Any = self._wrapped_policy(seen.to(self.policy_device) if cast else seen)
+        return acted.to(rows.device) if cast else acted
 
-    def _step_env(
-        self,
-        root: TensorDictBase,
-        whole: TensorDictBase,
-        rows: Tensor,
-        handed_on: Set[NestedKey],
+    def _set_inputs(
+        self, root: TensorDictBase, acted: TensorDictBase, active: _Active | None
     ) -> TensorDictBase:
-        """Step the active rows, which `root` holds; `whole` is the last step of all rows.
+        """Let the active rows act; those that have ended act as some other one, to no effect."""
+        if self._flow is None:
+            return root.update(acted.select(*self._acted_on, strict=False))
+        batch = root.batch_size
+        for key in self._flow.inputs:
+            value = acted.get(key)
+            if active is not None:
+                value = value.index_select(0, active.place).unflatten(0, batch)
+            root.set(key, value)
+        if active is not None:
+            root.set("_step", active.mask.view(*batch, 1))
+        return root
 
-        What the policy hands to its own next step stays out of the environment. Returns the new
-        step of all rows, in which those that have ended act as they last did, to no effect.
-        """
-        if len(rows) == self.n_env:
-            return self.env.step(root)
-        batch = self.env.batch_size
-        inputs = self.env.step_mdp(whole)
-        for key in self._acted_on:
-            acted = root.get(key, None)
-            if acted is not None and key not in handed_on:
-                before = whole.get(key)
-                after = before.flatten(0, len(batch) - 1).index_copy(0, rows, acted)
-                inputs.set(key, after.view_as(before))
-        active = torch.zeros(self.n_env, dtype=torch.bool, device=rows.device)
-        active[rows] = True
-        whole = self.env.step(inputs.set("_step", active.view(*batch, 1)))
-        following = whole.get("next").exclude(*handed_on).reshape(-1)[rows]
-        # What the policy hands on prevails, as in a step of all rows.
-        root.set("next", following.update(root.get("next", TensorDict())))
-        return whole
+    def _trace_flow(self, step: TensorDictBase, acted: TensorDictBase) -> _Flow:
+        """Tell from a first step what becomes of each entry."""
+        every = set(step.keys(True, True))
+        given = {key for key in every if key[0] != "next"}
+        result = {unravel_key(key[1:]) for key in every - given}
+        written = set(acted.keys(True, True))
+        carried = {unravel_key(key[1:]): key for key in written if key[0] == "next"}
+        dropped = self.exclude_keys | carried.keys()
+        written -= set(carried.values()) | (given - set(self._written))
+        read = given | written if self._read is None else set(self._read)
+        carried |= {key: key for key in (written & read) - result - carried.keys()}
+        recorded = step.copy().update(acted.select(*written))
+        kept = _recorded_keys(recorded, dropped, self.compact_obs)
+        return _Flow(
+            inputs=[key for key in self._acted_on if key in written],
+            shown=[key for key in given & read if key not in carried],
+            carried=carried,
+            kept=[key for key in kept if key not in written | {self.group_key}],
+            decided=[key for key in kept if key in written],
+        )
 
-    def _finish(self, history: _History, group: Tensor) -> TensorDictBase:
-        steps, row = history.by_row()
-        ids = self._traj_pool.get_traj_and_increment(self.n_env, device=row.device)
-        steps.set(self.group_key, group.reshape(-1)[row]).set(TRAJECTORY_KEY, ids[row])
-        device = self.storing_device
-        return steps if device is None else steps.to(device)
+    def _pack(self, rounds: list[_Round]) -> TensorDictBase:
+        num_steps = max(map(len, rounds))
+        padded = []
+        for one in rounds:
+            steps = one.pad(num_steps)
+            mask = steps[MASK_KEY]
+            ids = self._traj_pool.get_traj_and_increment(self.n_env, device=mask.device)
+            steps.set(self.group_key, one.group.reshape(-1, 1) * mask)
+            padded.append(steps.set(TRAJECTORY_KEY, ids.unsqueeze(-1) * mask))
+        groups: Any = padded[0] if len(padded) == 1 else TensorDict.cat(padded)
+        groups = groups.unflatten(0, (self.num_groups, self.group_size))
+        return groups if self.storing_device is None else groups.to(self.storing_device)
 
     @property
     def restarted_trajectories(self) -> int:
@@ -396,28 +431,109 @@ def _recorded_keys(
     return kept
 
 
-class _History:
-    """The steps of a round: of all rows at first, of fewer and fewer later."""
+@dataclass
+class _Flow:
+    """What becomes of each entry of a step."""
 
-    def __init__(self, keys: list[NestedKey]) -> None:
-        self._keys = keys
-        self._whole: list[TensorDictBase] = []  # [*B, K] each
-        self._partial: list[TensorDictBase] = []  # [n] each
-        self._rows: list[Tensor] = []  # of both, [n] each
+    inputs: list[NestedKey]
+    """What the policy writes and the environment acts on."""
+    shown: list[NestedKey]
+    """What the policy reads of the environment's entries."""
+    carried: dict[NestedKey, NestedKey]
+    """What the policy reads of its own, and where it wrote that in the step before."""
+    kept: list[NestedKey]
+    """What a batch keeps of the environment's entries."""
+    decided: list[NestedKey]
+    """What a batch keeps of the policy's."""
 
-    def append(self, root: TensorDictBase, rows: Tensor) -> None:
-        step = root.select(*self._keys)
-        whole = not self._whole or root.shape == self._whole[0].shape
-        (self._whole if whole else self._partial).append(step)
+
+class _Active:
+    """The rows `[n]` of `size` that go on: which, and where a row stands among them."""
+
+    def __init__(self, rows: Tensor, size: int) -> None:
+        self.mask = torch.zeros(size, dtype=torch.bool, device=rows.device)
+        self.mask.index_fill_(0, rows, True)
+        self.place = torch.zeros(size, dtype=torch.int64, device=rows.device)  # 0 if it is not
+        self.place.index_copy_(0, rows, torch.arange(len(rows), device=rows.device))
+
+
+def _show(
+    root: TensorDictBase,
+    acted: TensorDictBase,
+    rows: Tensor,
+    going_on: Tensor | None,
+    flow: _Flow,
+) -> TensorDictBase:
+    """What the policy sees next: the environment's entries, then what it hands to itself.
+
+    `root` has all rows, of which `rows` `[n]` go on; `acted` has those that were active before, of
+    which `going_on` `[n]` go on, None for all.
+    """
+    whole = len(rows) == root.numel()
+    seen = {key: _choose(root.get(key), None if whole else rows, root.ndim) for key in flow.shown}
+    for key, source in flow.carried.items():
+        seen[key] = _choose(acted.get(source), going_on, acted.ndim)
+    shape = root.batch_size if whole else rows.shape
+    return TensorDict(seen, batch_size=shape, device=root.device)
+
+
+def _choose(entry: Any, rows: Tensor | None, ndim: int) -> Any:
+    """Rows `[n]`, None for all, of an entry with `ndim` batch dimensions, counted over them all."""
+    if rows is None:
+        return entry
+    if not isinstance(entry, Tensor):
+        return entry.reshape(-1)[rows]
+    return (entry.flatten(0, ndim - 1) if ndim > 1 else entry).index_select(0, rows)
+
+
+class _Round:
+    """One trajectory in each row, `N = prod(B) * K` rows: all begin, fewer and fewer go on.
+
+    The environment's entries are recorded of all rows, the policy's of those that it saw; which
+    ones count is sorted out once, at the end.
+    """
+
+    flow: _Flow
+
+    def __init__(self, group: Tensor) -> None:
+        self.group = group  # [*B, K]
+        self._whole: list[list[Tensor]] = []  # [*B, K, *] each
+        self._partial: list[list[Tensor]] = []  # [n, *] each
+        self._rows: list[Tensor] = []  # [n] each
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def append(
+        self, step: TensorDictBase, acted: TensorDictBase, rows: Tensor, flow: _Flow
+    ) -> None:
+        self.flow = flow
+        self._whole.append([step.get(key) for key in flow.kept])
+        last = acted.ndim - 1
+        self._partial.append([acted.get(key).flatten(0, last) for key in flow.decided])
         self._rows.append(rows)
 
-    def by_row(self) -> tuple[Any, Tensor]:
-        """Return the steps `[S]`, trajectory after trajectory, and the row of each."""
-        whole: Any = TensorDict.stack(self._whole)
-        row = torch.cat(self._rows)
-        steps = TensorDict.cat([whole.reshape(-1), *self._partial])
-        order = row.argsort(stable=True)
-        return steps[order], row[order]
+    def pad(self, num_steps: int) -> TensorDictBase:
+        """Return trajectories `[N, num_steps]`, with zeros after their ends, and their mask."""
+        row, shape = torch.cat(self._rows), (self.group.numel(), num_steps)
+        time = [torch.full_like(rows, t) for t, rows in enumerate(self._rows)]
+        place = row * num_steps + torch.cat(time)
+        mask = torch.zeros(shape, dtype=torch.bool, device=row.device)
+        mask.view(-1).index_fill_(0, place, True)
+        groups = TensorDict({MASK_KEY: mask}, batch_size=shape)
+        ended = ~mask[:, : len(self)]
+        for key, steps in zip(self.flow.kept, zip(*self._whole, strict=True), strict=True):
+            value = torch.stack(steps, self.group.ndim).flatten(0, self.group.ndim - 1)
+            value.masked_fill_(ended.view(*ended.shape, *(1,) * (value.ndim - 2)), 0)
+            if len(self) < num_steps:
+                padding = (0, 0) * (value.ndim - 2) + (0, num_steps - len(self))
+                value = nn.functional.pad(value, padding)
+            groups.set(key, value)
+        for key, steps in zip(self.flow.decided, zip(*self._partial, strict=True), strict=True):
+            value = torch.cat(steps)
+            padded = value.new_zeros(mask.numel(), *value.shape[1:]).index_copy_(0, place, value)
+            groups.set(key, padded.view(*shape, *value.shape[1:]))
+        return groups
 
 
 def _check_arguments(num_groups: int, group_size: int, options: dict[str, Any]) -> None:

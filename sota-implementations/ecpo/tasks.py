@@ -24,7 +24,6 @@ from torchrl.envs import (
     EnvBase,
     ExplorationType,
     GymEnv,
-    InitTracker,
     SerialEnv,
     StepCounter,
     TransformedEnv,
@@ -122,7 +121,6 @@ def make_algorithmic(config: DictConfig) -> Task:
             "greedy_attained": _returns(episodes).sum() / episodes["attainable"][..., 0].sum(),
         }
 
-    env = TransformedEnv(env, InitTracker())
     return Task(env, actor, measure, evaluate, ("return", "level", "attained", "entropy", "ESS"))
 
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pickle
 from copy import deepcopy
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -18,7 +19,11 @@ from torchrl.envs import (
     check_env_specs,
     set_exploration_type,
 )
-from torchrl.modules import get_env_transforms_from_module, set_recurrent_mode
+from torchrl.modules import (
+    ProbabilisticActor,
+    get_env_transforms_from_module,
+    set_recurrent_mode,
+)
 
 from torchrl_ecpo.modules import DistinctHistoryLSTM, TupleCategorical, make_tuple_policy
 from torchrl_ecpo.modules.histories import distinct_histories, hash_states, mix
@@ -55,6 +60,15 @@ class TestTupleCategorical:
         assert_close(dist.entropy().squeeze(-1), -(log_probs.exp() * log_probs).sum(-1))
         assert_close(dist.mode.squeeze(1), actions[log_probs.argmax(-1)])
         assert_close(dist.deterministic_sample, dist.mode)
+
+    def test_sample_and_log_prob(self, head: str, dtype: torch.dtype) -> None:
+        dist = random_dist(head, 7, dtype=dtype)
+        torch.manual_seed(0)
+        expected = dist.sample((5,))
+        torch.manual_seed(0)
+        action, log_prob = dist.sample_and_log_prob((5,))
+        assert_close(action, expected, rtol=0, atol=0)
+        assert_close(log_prob, dist.log_prob(expected), rtol=0, atol=0)
 
     def test_sample(self, head: str, dtype: torch.dtype) -> None:
         torch.manual_seed(0)
@@ -124,7 +138,7 @@ def test_distribution_gradients(head: str) -> None:
         ({"nvec": (3, 3, 4)}, r"nvec: expected \(moves, 2, characters\).* got \(3, 3, 4\)"),
         ({"nvec": (3, 2)}, r"nvec: .* got \(3, 2\)"),
         ({"logits": torch.zeros(2, 8)}, r"last dimension of 9 .* got shape \(2, 8\)"),
-        ({"logits": torch.full((2, 9), torch.nan)}, "parameter logits .*invalid values"),
+        ({"logits": torch.full((2, 9), torch.nan)}, "logits: .*got NaN"),
     ],
 )
 def test_distribution_refuses(arguments: dict[str, Any], message: str) -> None:
@@ -282,6 +296,27 @@ def num_distinct(data: TensorDict, mask: torch.Tensor) -> int:
             history = (*(() if init[t] else history), (t, *row[t]))
             histories.add(history)
     return len(histories)
+
+
+@pytest.mark.parametrize("kind", [None, ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
+@pytest.mark.parametrize("distinct", [True, False])
+def test_the_actor_acts_as_its_base_class_does(
+    kind: ExplorationType | None, distinct: bool
+) -> None:
+    policy = both_policies()[not distinct]
+    step = sequences("shared", 12, steps=3)[:, 0]
+    outcomes = []
+    with set_exploration_type(kind):
+        for act in (policy, partial(ProbabilisticActor.forward, policy)):
+            torch.manual_seed(1)
+            outcomes.append(act(step.clone()).to_dict())
+    assert_close(*outcomes, rtol=0, atol=0)
+
+
+def test_the_actor_writes_selected_keys_only() -> None:
+    policy = both_policies()[0].select_out_keys("action")
+    step = sequences("shared", 12, steps=3)[:, 0]
+    assert set(policy(step.clone()).keys()) == {*step.keys(), "action"}
 
 
 KINDS = ["shared", "equal", "distinct", "restarts"]

@@ -618,13 +618,17 @@ class AlgorithmicEnv(EnvBase):
         active, selected = ~self._ended, tensordict.get("_step", None)
         if selected is not None:
             active &= selected.reshape(-1)
-        if active.all():
+        rows = active.nonzero().squeeze(-1)
+        if len(rows) == len(active):
             reward = self._advance(slice(None), action)
         else:
-            rows = _indices(active)
-            reward = self._return.new_zeros(self.numel())
-            reward[rows] = self._advance(rows, action[rows])
+            reward = self._advance(rows, action.index_select(0, rows))
+            reward = torch.zeros_like(self._return).index_copy_(0, rows, reward)
         return self._output().set("reward", reward.view(*self.batch_size, 1))
+
+    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
+        """What a step returns is complete, so that there is nothing to add."""
+        return next_tensordict_out
 
     def _advance(self, rows: Tensor | slice, action: Tensor) -> Tensor:
         """Act in the episodes `rows`, return the rewards: the tasks' rules are here."""

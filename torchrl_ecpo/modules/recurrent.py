@@ -158,10 +158,10 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
             ended = ended.reshape(shape)
             starts, symbols = starts | ended, symbols.masked_fill(ended, 0)
         symbols, starts = symbols.reshape(1, -1), starts.reshape(1, -1)
-        nodes, output, h, c = self._run(symbols, starts, None, self._states(tensordict, starts))
-        tensordict.set(self.out_keys[0], _rows(output, nodes, shape))
-        for key, state in zip(self.out_keys[1:], (h, c), strict=True):
-            tensordict.set(key, _rows(state, nodes, (*shape, 1)))
+        nodes, *values = self._run(symbols, starts, None, self._states(tensordict, starts))
+        nodes = nodes.view(-1)
+        for key, value, ndim in zip(self.out_keys, values, (0, 1, 1), strict=True):
+            tensordict.set(key, value.index_select(0, nodes).view(*shape, *(1,) * ndim, -1))
         return tensordict
 
     def _run(
@@ -206,8 +206,8 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
                 f"{self.input_keys}: expected {len(self.num_classes)} integers in all, one for "
                 f"each of num_classes, got {classes.shape[-1]}."
             )
-        sizes, weights, _ = _radix(self.num_classes, classes.device)
-        if ((classes < 0) | (classes >= sizes)).any():
+        _, weights, _, first, last = _radix(self.num_classes, classes.device)
+        if not torch.equal(torch.clamp(classes, first, last), classes):
             flat = classes.reshape(-1, len(self.num_classes))
             raise ValueError(
                 f"{self.input_keys}: expected classes in [0, n) for n in {self.num_classes}, got "
@@ -217,14 +217,16 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
 
     def _project(self, symbols: Tensor) -> Tensor:
         """The input's part of the gates, `[S, 4H]`: a one-hot product is a sum of columns."""
-        sizes, weights, offsets = _radix(self.num_classes, symbols.device)
+        sizes, weights, offsets, *_ = _radix(self.num_classes, symbols.device)
         hot = symbols.unsqueeze(-1) // weights % sizes + offsets
         columns = F.embedding_bag(hot, self.cell.weight_ih.t().contiguous(), mode="sum")
         return columns + (self.cell.bias_ih + self.cell.bias_hh)
 
     def _states(self, tensordict: TensorDictBase, starts: Tensor) -> tuple[Tensor, Tensor] | None:
         """The states `[N, H]` that rows continue from; None where all start."""
-        if starts[0].all():
+        h, c = (tensordict.get(key, None) for key in self.state_keys)
+        # A single step with states can do without the question.
+        if (recurrent_mode() or h is None or c is None) and starts[0].all():
             return None
         if recurrent_mode() and not self.store_states:
             raise ValueError(
@@ -232,7 +234,6 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
                 "states are not stored, and some do not; keep trajectories whole, or make the "
                 "policy with store_states=True."
             )
-        h, c = (tensordict.get(key, None) for key in self.state_keys)
         if h is None or c is None:
             raise KeyError(
                 f"{self.state_keys}: expected the states of rows that continue a trajectory, found "
@@ -264,11 +265,14 @@ class _TransientPrimer(TensorDictPrimer):
 
 
 @lru_cache(maxsize=64)
-def _radix(num_classes: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Bases and weights of input tuples as numbers; where each digit's one-hot vector starts."""
+def _radix(num_classes: tuple[int, ...], device: torch.device) -> tuple[Tensor, ...]:
+    """Bases and weights of input tuples as numbers; where each digit's one-hot vector starts.
+
+    Then each digit's least and greatest value.
+    """
     sizes = torch.tensor(num_classes, device=device)
     weights = sizes.flip(0).cumprod(0).flip(0) // sizes
-    return sizes, weights, sizes.cumsum(0) - sizes
+    return sizes, weights, sizes.cumsum(0) - sizes, torch.zeros_like(sizes), sizes - 1
 
 
 def _time_first(x: Tensor | None) -> Any:

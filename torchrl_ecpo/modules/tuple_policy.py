@@ -6,16 +6,13 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
-from tensordict import NestedKey
-from tensordict.nn import (
-    TensorDictModule,
-    TensorDictSequential,
-)
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torch.distributions import Distribution, constraints
 from torch.distributions.utils import lazy_property
 from torch.nn import functional as F
-from torchrl.envs import ExplorationType
+from torchrl.envs import ExplorationType, exploration_type
 from torchrl.modules import LSTMModule, ProbabilisticActor
 
 from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
@@ -80,8 +77,12 @@ class TupleCategorical(Distribution):
                 f"logits: expected a last dimension of {size} for head={head!r} and "
                 f"nvec={tuple(nvec)}, got shape {tuple(logits.shape)}."
             )
+        if validate_args and logits.isnan().any():
+            raise ValueError("logits: expected numbers, got NaN; the network's weights may be NaN.")
         self.nvec, self.head, self.logits = tuple(nvec), head, logits
-        super().__init__(logits.shape[:-1], torch.Size([3]), validate_args=validate_args)
+        # The base class would check the same constraint, at several times the cost.
+        super().__init__(logits.shape[:-1], torch.Size([3]), validate_args=False)
+        self._validate_args = validate_args
 
     @staticmethod
     def num_logits(nvec: Sequence[int], head: Head = "masked") -> int:
@@ -129,8 +130,20 @@ class TupleCategorical(Distribution):
         uniform = torch.rand(
             (*sample_shape, *logits.shape), dtype=logits.dtype, device=logits.device
         )
-        gumbel = uniform.log_().neg_().log_().neg_()
-        return self._decode(self._factors(logits + gumbel).argmax(-1))
+        gumbel = uniform.log_().neg_().log_()  # its negative
+        return self._decode(self._factors(logits - gumbel).argmax(-1))
+
+    def sample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
+        """Draw actions and give their log-probabilities; there is no need to check their range.
+
+        Args:
+            sample_shape: the shape of the sample, before the batch shape.
+
+        Returns:
+            int64 `[*sample_shape, *B, 3]` and `[*sample_shape, *B]`.
+        """
+        action = self.sample(sample_shape)
+        return action, self._score(action)
 
     @property
     def mode(self) -> Tensor:
@@ -161,13 +174,17 @@ class TupleCategorical(Distribution):
         """
         if self._validate_args:
             self._check_range(value)
-        index = self._encode(value)
-        shape = index.shape[:-1]
-        if shape != self.batch_shape:
-            shape = torch.broadcast_shapes(shape, self.batch_shape)
-        log_probs = self._log_probs.expand(*shape, *self._log_probs.shape[-2:])
-        index = index.expand(*shape, -1).unsqueeze(-1)
-        return self._sum(log_probs.gather(-1, index).squeeze(-1), value[..., 1] == 1)
+        return self._score(value)
+
+    def _score(self, value: Tensor) -> Tensor:
+        """Log-probability of actions within range."""
+        index, log_probs = self._encode(value), self._log_probs
+        if index.shape[:-1] != self.batch_shape:
+            shape = torch.broadcast_shapes(index.shape[:-1], self.batch_shape)
+            log_probs = log_probs.expand(*shape, *log_probs.shape[-2:])
+            index = index.expand(*shape, -1)
+        log_probs = log_probs.gather(-1, index.unsqueeze(-1)).squeeze(-1)
+        return self._sum(log_probs, value[..., 1] == 1)
 
     def entropy(self) -> Tensor:
         """Exact entropy of the tuple, in nats, `[*B]`."""
@@ -192,11 +209,12 @@ class TupleCategorical(Distribution):
         if self.head == "joint":
             return values.unsqueeze(-2)
         width = max(self.nvec)
-        padding = values.new_full((), -torch.inf)
-        pieces = []
-        for part in values.split(self.nvec, -1):
-            pieces += [part, padding.expand(*part.shape[:-1], width - part.shape[-1])]
-        return torch.cat(pieces, -1).unflatten(-1, (3, width))
+        if min(self.nvec) < width:
+            parts = values.split(self.nvec, -1)
+            values = torch.cat(
+                [F.pad(part, (0, width - part.shape[-1]), value=-torch.inf) for part in parts], -1
+            )
+        return values.unflatten(-1, (3, width))
 
     def _sum(self, log_probs: Tensor, writes: Tensor) -> Tensor:
         """The tuple's log-probability from its factors' `[..., F]`."""
@@ -212,7 +230,7 @@ class TupleCategorical(Distribution):
             move = choice.squeeze(-1) // (1 + self.nvec[2])
             return torch.stack([move, (written > 0).long(), (written - 1).clamp(min=0)], -1)
         if self.head == "masked":
-            choice[..., 2] *= choice[..., 1]
+            choice[..., 2].mul_(choice[..., 1])
         return choice
 
     def _encode(self, action: Tensor) -> Tensor:
@@ -269,7 +287,8 @@ def make_tuple_policy(
 
     Returns:
         The actor. Its environment needs `InitTracker()` and, to sample, the state's primer:
-        `torchrl.modules.get_env_transforms_from_module(actor)` gives both.
+        `torchrl.modules.get_env_transforms_from_module(actor)` gives both, and
+        `TrajectoryGroupCollector` does without either.
 
     Raises:
         ValueError: if `head` or `nvec` are not as above.
@@ -317,7 +336,7 @@ def make_tuple_policy(
             TensorDictModule(readout, in_keys=["embed"], out_keys=["logits"]),
         ]
         core = TensorDictSequential(*modules)
-    return ProbabilisticActor(
+    return _TupleActor(
         core,
         in_keys=["logits"],
         distribution_class=TupleCategorical,
@@ -326,6 +345,26 @@ def make_tuple_policy(
         return_log_prob=True,
         log_prob_key="action_log_prob",
     )
+
+
+class _TupleActor(ProbabilisticActor):
+    """Samples in one pass; whatever else is asked of it goes the way of its base class.
+
+    That way costs as much as the LSTM over a few distinct histories.
+    """
+
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        """Write what the core writes, action and log-probability; see the base class."""
+        modules: Any = self.module
+        core, head = modules
+        kind = exploration_type() or head.default_interaction_type
+        usual = len(args) == 1 and isinstance(args[0], TensorDictBase) and not kwargs
+        if not usual or kind is not ExplorationType.RANDOM or self._select_before_return:
+            return super().forward(*args, **kwargs)
+        tensordict = core(args[0])
+        distribution = TupleCategorical(tensordict.get("logits"), **head.distribution_kwargs)
+        action, log_prob = distribution.sample_and_log_prob()
+        return tensordict.set("action", action).set("action_log_prob", log_prob)
 
 
 class _OneHot(nn.Module):
