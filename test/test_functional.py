@@ -16,8 +16,10 @@ from torch.testing import assert_close
 
 from torchrl_ecpo.functional import (
     Surrogate,
+    centred_gaussian_projection,
     check_temperatures,
     effective_sample_size,
+    lift_divergence_estimate,
     lifted_log_weights,
     mean_seeking_projection,
     ment_surrogate,
@@ -27,6 +29,7 @@ from torchrl_ecpo.functional import (
     soft_value_estimate,
     surrogate_reward,
     surrogate_reward_estimate,
+    temperature_dual,
     theorem1_temperatures,
     urex_surrogate,
 )
@@ -750,6 +753,340 @@ def test_the_largest_numbers_never_give_nan(name, dtype, masked):
             assert not value.isnan()
             assert not any(y.isnan().any() for y in per_sample)
             assert_close(per_sample[0].sum().item(), 1.0)
+
+
+# ------------------------------------------------------------- the lift's divergence, temperatures
+
+
+@DTYPES
+@pytest.mark.parametrize(
+    ("weights", "mask", "expected"),
+    [
+        ((0.25, 0.25, 0.25, 0.25), None, 0.0),
+        ((0.0, 1.0, 0.0, 0.0), None, math.log(4)),
+        ((0.5, 0.25, 0.25), None, 0.5 * math.log(1.5) + 0.5 * math.log(0.75)),
+        ((0.75, 0.25, 0.0), (True, True, False), 0.75 * math.log(1.5) + 0.25 * math.log(0.5)),
+        ((1.0, 0.0, 0.0), (True, False, False), 0.0),
+        ((0.0, 0.0), (False, False), 0.0),
+    ],
+)
+def test_lift_divergence_estimate_by_hand(dtype, weights, mask, expected):
+    actual = lift_divergence_estimate(
+        vector(*weights, dtype=dtype), mask=None if mask is None else torch.tensor(mask)
+    )
+    assert actual.dtype == dtype
+    assert_close(actual.item(), expected, atol=1e-6, rtol=1e-6)
+
+
+@PROPERTY
+@given(x=groups(), scale=st.floats(0, 1e3))
+def test_lift_divergence_estimate_is_between_zero_and_log_m(x, scale):
+    weights = self_normalised_weights(scale * x.score)
+    actual = lift_divergence_estimate(weights)
+    assert 0 <= actual <= math.log(weights.numel()) + 1e-9
+    assert_close(lift_divergence_estimate(weights.flip(0)), actual)
+
+
+@COUNTS
+@TEMPERATURES
+def test_lift_divergence_estimate_is_exact_on_an_exact_sample(counts, tau, tau_prime):
+    case = enumeration(counts, on_policy=False)
+    case = case._replace(reference=case.behaviour)
+    weights = self_normalised_weights(case.log_weights(tau, tau_prime)[case.index])
+    target = case.lifted(tau, tau_prime)
+    expected = (target.exp() * (target - case.reference)).sum()
+    assert_close(lift_divergence_estimate(weights), expected)
+
+
+@pytest.mark.parametrize("dim", [-3, -1, 0, 1])
+def test_lift_divergence_estimate_takes_the_sample_dim(dim):
+    weights = self_normalised_weights(random_samples(2, 3, 4).score)
+    moved = lift_divergence_estimate(weights.movedim(-1, dim), sample_dim=dim)
+    assert_close(moved, lift_divergence_estimate(weights))
+
+
+@DTYPES
+@pytest.mark.parametrize("excess", [0.3, 0.0, -0.7])
+def test_temperature_dual_by_hand(dtype, excess):
+    """A temperature that is too low goes up, one that is too high goes down; the excess stays."""
+    log_tau = torch.tensor(0.5, dtype=dtype).log().requires_grad_()
+    slack = torch.tensor([excess, 2 * excess], dtype=dtype, requires_grad=True)
+    loss = temperature_dual(log_tau, slack)
+    assert_close(loss, math.log(2) * slack)
+    loss.sum().backward()
+    assert_close(log_tau.grad.item(), -3 * excess)
+    assert slack.grad is None
+
+
+# ---------------------------------------------------------------------------- the centred scale
+
+
+class GaussianGradient(NamedTuple):
+    """Of a projection, with respect to the mean and the log-scale; and what it returned."""
+
+    loss: Tensor
+    mean: Tensor
+    log_scale: Tensor
+
+
+def gaussian_gradient(projection, loc, scale, samples, log_weights, **where) -> GaussianGradient:
+    loc = loc.detach().requires_grad_()
+    log_scale = scale.detach().log().requires_grad_()
+    loss = projection(loc, log_scale.exp(), samples, log_weights, **where).loss
+    return GaussianGradient(loss.detach(), *torch.autograd.grad(loss.sum(), (loc, log_scale)))
+
+
+def paper_projection(loc, scale, samples, log_weights, *, sample_dim=-1) -> Surrogate:
+    """Eq. 11 of a diagonal Gaussian, ``samples`` ``[M, *B, A]`` with the axis 0."""
+    log_prob = torch.distributions.Normal(loc, scale).log_prob(samples).sum(-1)
+    return mean_seeking_projection(log_prob, log_weights, sample_dim=sample_dim)
+
+
+def sample_variance(projection, samples: Tensor, log_weights: Tensor) -> Tensor:
+    """The S that the scale is fitted to, ``[*B]``: of the gradient 1 - S at a standard Gaussian."""
+    zero = torch.zeros(*samples.shape[1:], dtype=samples.dtype)
+    grad = gaussian_gradient(
+        projection, zero, torch.ones_like(zero), samples, log_weights, sample_dim=0
+    )
+    return (1 - grad.log_scale).squeeze(-1)
+
+
+@DTYPES
+def test_centred_gaussian_projection_by_hand(dtype):
+    """m = 0/8 + 8/8 + 40/8 = 6, V = (36 + 2 * 4 + 5 * 4) / 8 = 8, sum w^2 = 30/64."""
+    log_weights = vector(1, 2, 5, dtype=dtype).log()
+    samples = vector(0, 4, 8, dtype=dtype).unsqueeze(-1)
+    loc, scale = vector(2, dtype=dtype), vector(2, dtype=dtype)
+    variance = 8 / (34 / 64)
+    grad = gaussian_gradient(
+        centred_gaussian_projection, loc, scale, samples, log_weights, sample_dim=0
+    )
+    assert_close(grad.mean.item(), (2 - 6) / 4)
+    assert_close(grad.log_scale.item(), 1 - variance / 4)
+    expected = math.log(2) + 0.5 * (variance / 4 + (6 - 2) ** 2 / 4 + math.log(2 * math.pi))
+    assert_close(grad.loss.item(), expected)
+    weights = centred_gaussian_projection(loc, scale, samples, log_weights, sample_dim=0).weights
+    assert_close(weights, vector(1 / 8, 2 / 8, 5 / 8, dtype=dtype))
+    # To the letter: the same gradient of the mean, and (6 - 2)^2 in that of the scale.
+    paper = gaussian_gradient(paper_projection, loc, scale, samples, log_weights, sample_dim=0)
+    assert_close(paper.mean, grad.mean)
+    assert_close(paper.log_scale.item(), 1 - (8 + 16) / 4)
+
+
+def test_centred_and_paper_gradients_of_the_mean_are_the_same():
+    x = random_samples(6, 3, 5)
+    samples = random_samples(6, 3, 5, 2, seed=1).score
+    loc, scale = random_samples(3, 5, 2).score, random_samples(3, 5, 2, seed=2).score.exp()
+    grads = [
+        gaussian_gradient(projection, loc, scale, samples, x.score, sample_dim=0)
+        for projection in (centred_gaussian_projection, paper_projection)
+    ]
+    assert_close(grads[0].mean, grads[1].mean)
+    assert not torch.allclose(grads[0].log_scale, grads[1].log_scale)
+
+
+@pytest.mark.parametrize("shape", [(), (2,), (2, 3)], ids=str)
+@pytest.mark.parametrize("masked", [False, True])
+def test_centred_projection_of_any_shape(shape, masked):
+    """States are independent, the sample axis may stand anywhere, masked samples are nowhere."""
+    log_weights = random_samples(*shape, 4).score
+    samples = random_samples(*shape, 4, 2, seed=1).score
+    loc, scale = random_samples(*shape, 2).score, random_samples(*shape, 2, seed=2).score.exp()
+    mask = random_samples(*shape, 4, seed=3).score > -0.8 if masked else None
+    if mask is not None:
+        mask[..., 0] = True
+        log_weights = log_weights.where(mask, math.nan)
+        samples = samples.where(mask.unsqueeze(-1), math.inf)
+    expected = gaussian_gradient(
+        centred_gaussian_projection, loc, scale, samples, log_weights, mask=mask
+    )
+    assert expected.loss.shape == shape
+    assert all(value.isfinite().all() for value in expected)
+    for state in itertools.product(*map(range, shape)):
+        real = slice(None) if mask is None else mask[state]
+        one = gaussian_gradient(
+            centred_gaussian_projection,
+            loc[state],
+            scale[state],
+            samples[state][real],
+            log_weights[state][real],
+        )
+        assert_close(tuple(one), tuple(value[state] for value in expected))
+    for dim in range(-len(shape) - 1, len(shape) + 1):
+        at = dim % (len(shape) + 1)
+        moved = gaussian_gradient(
+            centred_gaussian_projection,
+            loc,
+            scale,
+            samples.movedim(-2, at),
+            log_weights.movedim(-1, at),
+            sample_dim=dim,
+            mask=None if mask is None else mask.movedim(-1, at),
+        )
+        assert_close(tuple(moved), tuple(expected))
+
+
+def test_centred_projection_trains_the_policy_only():
+    tensors = {
+        "loc": torch.zeros(3, 2),
+        "scale": torch.ones(3, 2),
+        "samples": torch.randn(4, 3, 2),
+        "log_weights": torch.randn(4, 3),
+    }
+    for tensor in tensors.values():
+        tensor.requires_grad_()
+    loss, weights = centred_gaussian_projection(**tensors, sample_dim=0)
+    assert not weights.requires_grad
+    loss.sum().backward()
+    trained = [name for name, tensor in tensors.items() if tensor.grad is not None]
+    assert trained == ["loc", "scale"]
+
+
+@DTYPES
+@pytest.mark.parametrize("log_weights", [(0.0,), (0.0, -1e5, -1e5), (3e38, 0.0, -3e38)])
+def test_one_sample_says_nothing_of_the_scale(dtype, log_weights):
+    """Where all weight is on one sample the scale stays, the mean goes there."""
+    samples = torch.arange(1.0, len(log_weights) + 1, dtype=dtype).unsqueeze(-1)
+    grad = gaussian_gradient(
+        centred_gaussian_projection,
+        vector(0, dtype=dtype),
+        vector(0.5, dtype=dtype),
+        samples,
+        vector(*log_weights, dtype=dtype),
+        sample_dim=0,
+    )
+    assert_close(grad.mean.item(), -4.0)
+    assert_close(grad.log_scale.item(), 0.0, atol=1e-6, rtol=0)
+    assert grad.loss.isfinite()
+
+
+@settings(PROPERTY, max_examples=100)
+@given(data=st.data(), dtype=st.sampled_from([torch.float32, torch.float64]))
+def test_centred_projection_of_finite_input_is_never_nan(data, dtype):
+    m = data.draw(st.integers(1, 4))
+    rows = [
+        data.draw(st.lists(values, min_size=m, max_size=m))
+        for values in (EXTREME_SCORES, st.floats(-1e3, 1e3))
+    ]
+    log_weights, samples = (torch.tensor(row, dtype=dtype) for row in rows)
+    scale = torch.tensor([data.draw(st.sampled_from([1e-4, 1.0, 10.0]))], dtype=dtype)
+    grad = gaussian_gradient(
+        centred_gaussian_projection,
+        torch.zeros(1, dtype=dtype),
+        scale,
+        samples.unsqueeze(-1),
+        log_weights,
+        sample_dim=0,
+    )
+    assert all(value.isfinite().all() for value in grad)
+
+
+def _two_humps(u: Tensor) -> Tensor:
+    """Log-density, up to a constant, of a mixture that is no Gaussian."""
+    return torch.logaddexp(-0.5 * (u - 1) ** 2 / 0.3, -0.5 * (u + 2) ** 2 - 0.7)
+
+
+@pytest.mark.parametrize(
+    "log_density", [_two_humps, lambda u: -0.5 * (u - 1.5) ** 2 / 0.4], ids=["humps", "gaussian"]
+)
+@pytest.mark.parametrize("start", [(0.0, 1.0), (4.0, 0.3), (-3.0, 2.0)], ids=str)
+def test_both_projections_have_the_same_minimiser(log_density, start):
+    """Mean and variance of the target, by quadrature; and descent arrives there."""
+    grid = torch.linspace(-12, 12, 20_001, dtype=torch.float64)
+    log_weights = log_density(grid)
+    weights = log_weights.softmax(0)
+    mean = (weights * grid).sum()
+    scale = (weights * (grid - mean) ** 2).sum().sqrt()
+    tolerance = {"atol": 2e-3, "rtol": 0.0}  # sum w^2 of the grid
+    for projection in (centred_gaussian_projection, paper_projection):
+        at = [projection, mean.view(1), scale.view(1), grid.unsqueeze(-1), log_weights]
+        grad = gaussian_gradient(*at, sample_dim=0)
+        assert_close((grad.mean.item(), grad.log_scale.item()), (0.0, 0.0), **tolerance)
+        loc, log_scale = vector(start[0]), vector(math.log(start[1]))
+        for _ in range(300):
+            at[1], at[2] = loc, log_scale.exp()
+            grad = gaussian_gradient(*at, sample_dim=0)
+            # Newton's steps, shortened: units of the policy's own scale.
+            loc = loc - 0.2 * log_scale.exp().square().clamp(max=4.0) * grad.mean
+            log_scale = log_scale - (0.1 * grad.log_scale).clamp(-0.1, 0.1)
+        assert_close((loc.item(), log_scale.exp().item()), (mean.item(), scale.item()), **tolerance)
+
+
+WEIGHTS = {
+    "equal": (1.0,) * 8,
+    "unequal": (8.0, 5.0, 3.0, 2.0, 1.0, 1.0, 0.5, 0.1),
+    "two": (1.0, 1.0),
+    "four": (10.0, 1.0, 1.0, 1.0),
+}
+
+
+@pytest.mark.parametrize("name", WEIGHTS)
+def test_variance_of_the_centred_scale_is_unbiased(name):
+    """Over 40,000 draws of M samples; without 1 / (1 - sum w^2) it falls short by sum w^2."""
+    weights = vector(*WEIGHTS[name])
+    repetitions = 40_000
+    generator = torch.Generator().manual_seed(0)
+    samples = torch.randn(len(weights), repetitions, 1, generator=generator, dtype=torch.float64)
+    log_weights = weights.log().unsqueeze(-1).expand(-1, repetitions)
+    variance = sample_variance(centred_gaussian_projection, samples, log_weights)
+    standard_error = variance.std() / math.sqrt(repetitions)
+    assert (variance.mean() - 1).abs() < 4 * standard_error
+    share = (weights / weights.sum()).square().sum()
+    uncorrected = variance * (1 - share)
+    assert (uncorrected.mean() - 1).abs() > 10 * standard_error
+    assert (uncorrected.mean() - (1 - share)).abs() < 4 * standard_error
+
+
+@pytest.mark.parametrize(
+    ("slope", "m", "most"), [(0.25, 8, 0.02), (0.5, 8, 0.06), (0.5, 64, 0.013)]
+)
+def test_variance_of_a_lift_is_nearly_unbiased(slope, m, most):
+    """Weights that depend on the samples (Q linear: the target is N(slope, 1)) leave a bias."""
+    generator = torch.Generator().manual_seed(0)
+    samples = torch.randn(m, 1_600_000 // m, 1, generator=generator, dtype=torch.float64)
+    log_weights = slope * samples.squeeze(-1)
+    variance = sample_variance(centred_gaussian_projection, samples, log_weights)
+    share = self_normalised_weights(log_weights, sample_dim=0).square().sum(0)
+    bias = (variance.mean() - 1).item()
+    assert abs(bias) < most
+    uncorrected = ((variance * (1 - share)).mean() - 1).item()
+    assert uncorrected < bias - 0.8 / m
+
+
+def _entropy_excess(
+    projection, *, speed: float, m: int = 256, num_runs: int = 50, num_steps: int = 400
+) -> float:
+    """Entropy of a Gaussian policy that follows Q = -c/2 (a - speed t)^2, above the lift's own.
+
+    Each step lifts the policy as it is and takes one gradient step, before the mean has arrived.
+    The lift's fixed point has the variance tau'/c, wherever the optimum is.
+    """
+    tau, tau_prime, curvature, rate = 1.0, 0.25, 1.0, 0.1
+    torch.manual_seed(0)
+    loc = torch.zeros(num_runs, 1, dtype=torch.float64)
+    log_scale = torch.full_like(loc, 0.5 * math.log(tau_prime / curvature))
+    start = log_scale.mean().item()
+    entropy = []
+    for step in range(num_steps):
+        scale = log_scale.exp()
+        samples = loc + scale * torch.randn(m, *loc.shape, dtype=torch.float64)
+        score = -0.5 * curvature * (samples - speed * step).square().squeeze(-1)
+        log_prob = torch.distributions.Normal(loc, scale).log_prob(samples).squeeze(-1)
+        log_weights = lifted_log_weights(score, log_prob, tau=tau, tau_prime=tau_prime)
+        grad = gaussian_gradient(projection, loc, scale, samples, log_weights, sample_dim=0)
+        loc = loc - rate * scale.square() * grad.mean
+        log_scale = log_scale - rate * grad.log_scale
+        if step >= num_steps // 2:
+            entropy.append(log_scale.mean().item() - start)
+    return sum(entropy) / len(entropy)
+
+
+def test_centred_scale_keeps_the_entropy_where_the_letter_inflates_it():
+    """While the mean lags behind its target, which it does as long as the optimum moves."""
+    assert _entropy_excess(paper_projection, speed=0.02) > 0.2
+    assert abs(_entropy_excess(centred_gaussian_projection, speed=0.02)) < 0.01
+    for projection in (paper_projection, centred_gaussian_projection):
+        assert abs(_entropy_excess(projection, speed=0.0)) < 0.01
 
 
 # ----------------------------------------------------------------------------------------- compile

@@ -1,14 +1,26 @@
-"""The policies that the scripts build."""
+"""The policies and critics that the scripts build."""
 
+from torchrl_ecpo.modules.actor_critic import (
+    DenseNetwork,
+    make_deterministic_actor,
+    make_qvalue_network,
+    make_tanh_gaussian_actor,
+    make_value_network,
+)
 from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
 from torchrl_ecpo.modules.softmax import LinearSoftmax, SharedCategorical, make_softmax_policy
 from torchrl_ecpo.modules.tuple_policy import TupleCategorical, make_tuple_policy
 
 __all__ = [
+    "DenseNetwork",
     "DistinctHistoryLSTM",
     "LinearSoftmax",
     "SharedCategorical",
     "TupleCategorical",
+    "make_deterministic_actor",
+    "make_qvalue_network",
     "make_softmax_policy",
+    "make_tanh_gaussian_actor",
     "make_tuple_policy",
+    "make_value_network",
 ]

@@ -1,8 +1,16 @@
 """LossModules: they read keys, call :mod:`torchrl_ecpo.functional`, reduce and report."""
 
+from torchrl_ecpo.objectives.actor_critic import (
+    ActorCriticLoss,
+    ContinuousActorCriticLoss,
+    DiscreteActorCriticLoss,
+    Lift,
+)
+from torchrl_ecpo.objectives.ecac import DiscreteECACLoss, ECACLoss
 from torchrl_ecpo.objectives.ecpo import ECPOLoss
 from torchrl_ecpo.objectives.ment import MENTLoss
 from torchrl_ecpo.objectives.pmd import PMDLoss
+from torchrl_ecpo.objectives.pmd_ac import DiscretePMDACLoss, PMDACLoss
 from torchrl_ecpo.objectives.trajectory import (
     LiftProjectLoss,
     TrajectoryGroupLoss,
@@ -11,9 +19,17 @@ from torchrl_ecpo.objectives.trajectory import (
 from torchrl_ecpo.objectives.urex import UREXLoss
 
 __all__ = [
+    "ActorCriticLoss",
+    "ContinuousActorCriticLoss",
+    "DiscreteActorCriticLoss",
+    "DiscreteECACLoss",
+    "DiscretePMDACLoss",
+    "ECACLoss",
     "ECPOLoss",
+    "Lift",
     "LiftProjectLoss",
     "MENTLoss",
+    "PMDACLoss",
     "PMDLoss",
     "TrajectoryGroupLoss",
     "TrajectoryGroups",

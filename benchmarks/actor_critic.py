@@ -1,0 +1,158 @@
+"""Updates of ECAC against SAC, and the script's training loop against Stable-Baselines3's SAC.
+
+    python benchmarks/actor_critic.py --csv actor_critic.csv
+
+One thread, one process; what is compared takes turns. Networks, losses, buffer and collector are
+those of `sota-implementations/ecac` with its defaults: two layers of 256 units, batches of 256,
+HalfCheetah-v5. Figures are medians of processor time, which other processes disturb least.
+
+- update: the loss, its backward pass, Adam and the average of the delayed networks, on random data;
+  ECACLoss against TorchRL's SACLoss.
+- loop: all that a frame takes, environment, buffer and update, against Stable-Baselines3's
+  `SAC("MlpPolicy", "HalfCheetah-v5")`, whose networks and batches are of the same size.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import torch
+from csv_table import add_csv_option, write_csv
+from hydra import compose, initialize_config_dir
+from loop import Iteration, take_turns
+from omegaconf import DictConfig
+from tensordict import TensorDict, TensorDictBase
+
+SCRIPT = Path(__file__).resolve().parents[1] / "sota-implementations/ecac"
+sys.path.append(str(SCRIPT))
+
+from ecac import step  # noqa: E402 # pyright: ignore[reportMissingImports]
+from utils import (  # noqa: E402 # pyright: ignore[reportMissingImports]
+    make_actor,
+    make_collector,
+    make_environment,
+    make_loss,
+    make_optimizer,
+    make_policy,
+    make_replay_buffer,
+    make_updater,
+)
+
+UPDATES = {
+    "sac": ["loss=sac"],
+    "ecac, M = 8": ["loss=ecac"],
+    "ecac, M = 16": ["loss=ecac", "loss.options.num_action_samples=16"],
+}
+LOOPS = {"sac": ["loss=sac"], "ecac": ["loss=ecac"]}
+
+
+def configure(overrides: list[str]) -> DictConfig:
+    """The script's configuration."""
+    with initialize_config_dir(str(SCRIPT / "config"), version_base="1.3"):
+        frames = ["total_frames=-1", "collector.init_random_frames=0"]
+        return compose("config", ["env=halfcheetah", *frames, *overrides])
+
+
+def random_batch(env_batch: TensorDictBase, size: int) -> TensorDict:
+    """Transitions like those of an environment, but random and none the last."""
+    observation, action = (env_batch[key].shape[-1] for key in ("observation", "action"))
+    never = torch.zeros(size, 1, dtype=torch.bool)
+    return TensorDict(
+        {
+            "observation": torch.randn(size, observation),
+            "action": torch.rand(size, action) * 2 - 1,
+            "next": {
+                "observation": torch.randn(size, observation),
+                "reward": torch.randn(size, 1),
+                "done": never,
+                "terminated": never.clone(),
+            },
+        },
+        batch_size=[size],
+    )
+
+
+def update(config: DictConfig) -> Iteration:
+    """Updates on one random batch."""
+    env = make_environment(config, seed=0)
+    batch = random_batch(env.fake_tensordict(), config.replay_buffer.batch_size)
+    loss_module = make_loss(config, make_actor(config, env), env)
+    updater = make_updater(config, loss_module)
+    optimizer = make_optimizer(config.loss.lr, loss_module)
+
+    def iterate() -> int:
+        for _ in range(10):
+            step(optimizer, loss_module(batch), is_policy_due=True)
+            updater.step()
+        return 10
+
+    return iterate
+
+
+def script_loop(config: DictConfig) -> Iteration:
+    """A batch of the collector, and an update for each of its frames."""
+    env = make_environment(config, seed=0)
+    actor = make_actor(config, env)
+    loss_module = make_loss(config, actor, env)
+    updater = make_updater(config, loss_module)
+    optimizer = make_optimizer(config.loss.lr, loss_module)
+    replay_buffer = make_replay_buffer(config)
+    batches = iter(make_collector(config, make_policy(config.loss, actor, env)))
+
+    def iterate() -> int:
+        transitions = next(batches)
+        replay_buffer.extend(transitions.select(*loss_module.in_keys, strict=False))
+        for _ in range(len(transitions)):
+            step(optimizer, loss_module(replay_buffer.sample()), is_policy_due=True)
+            updater.step()
+        return len(transitions)
+
+    return iterate
+
+
+def peer_loop(frames: int) -> Iteration:
+    """As many frames of Stable-Baselines3's SAC."""
+    from stable_baselines3 import SAC
+
+    model = SAC("MlpPolicy", "HalfCheetah-v5", learning_starts=0, device="cpu", seed=0)
+    model.learn(1)
+
+    def iterate() -> int:
+        model.learn(frames, reset_num_timesteps=False)
+        return frames
+
+    return iterate
+
+
+def compare(kind: str, iterations: dict[str, Iteration], repeats: int) -> list[dict[str, object]]:
+    """Rows of the table: the time of a step of each, and relative to the first."""
+    processor, _, steps = take_turns(list(iterations.values()), repeats)
+    times = [time / count for time, count in zip(processor, steps, strict=True)]
+    return [
+        {"what": kind, "method": name, "ms": ms, "time": ms / times[0], "speed": times[0] / ms}
+        for name, ms in zip(iterations, times, strict=True)
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--repeats", type=int, default=40)
+    add_csv_option(parser)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    updates = {name: update(configure(overrides)) for name, overrides in UPDATES.items()}
+    rows = compare("update", updates, arguments.repeats)
+    frames = configure([]).collector.frames_per_batch
+    loops = {name: script_loop(configure(overrides)) for name, overrides in LOOPS.items()}
+    loops = {"Stable-Baselines3 SAC": peer_loop(frames), **loops}
+    rows += compare("loop", loops, arguments.repeats)
+    print("what    method                   ms a step  time ratio  speed ratio")
+    for row in rows:
+        print("{what:8}{method:24}{ms:10.2f}{time:12.2f}{speed:13.2f}".format(**row))
+    write_csv(arguments.csv, rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,131 @@
+"""Actors and critics for continuous actions."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import Bounded, OneHot
+from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl.modules import MLP
+from torchrl.objectives import SACLoss, SoftUpdate
+
+from torchrl_ecpo.modules import (
+    DenseNetwork,
+    make_deterministic_actor,
+    make_qvalue_network,
+    make_tanh_gaussian_actor,
+    make_value_network,
+)
+
+SPEC = Bounded(low=torch.tensor([-2.0, -0.4]), high=torch.tensor([2.0, 1.0]))
+ACTORS = [make_tanh_gaussian_actor, make_deterministic_actor]
+
+
+def states(*batch_size, **entries):
+    td = TensorDict({"observation": 9 * torch.randn(*batch_size, 3)}, batch_size=batch_size)
+    return td.update(entries)
+
+
+def copy_weights(network, mlp):
+    layers = [layer for layer in mlp if isinstance(layer, nn.Linear)]
+    for i, layer in enumerate(layers):
+        layer.weight.data.copy_(getattr(network, f"weight_{i}"))
+        layer.bias.data.copy_(getattr(network, f"bias_{i}"))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("hidden", [[], [8], [8, 5]])
+def test_a_dense_network_computes_what_an_mlp_does(hidden, dtype):
+    network = DenseNetwork(["a", "b"], ["out"], [5, *hidden, 2]).to(dtype)
+    mlp = MLP(in_features=5, out_features=2, num_cells=hidden, activation_class=nn.ReLU).to(dtype)
+    copy_weights(network, mlp)
+    td = TensorDict(
+        {"a": torch.randn(4, 7, 3, dtype=dtype), "b": torch.randn(4, 7, 2, dtype=dtype)}, [4, 7]
+    )
+    expected = TensorDictModule(mlp, ["a", "b"], ["out"])(td.clone())["out"]
+    torch.testing.assert_close(network(td)["out"], expected)
+    torch.testing.assert_close(network(a=td["a"], b=td["b"]), expected)
+
+
+def test_a_dense_network_starts_as_layers_of_torch_do():
+    torch.manual_seed(0)
+    network = DenseNetwork(["a"], ["out"], [100, 400, 1])
+    for name, fan_in in (("weight_0", 100), ("bias_0", 100), ("weight_1", 400)):
+        values = getattr(network, name).detach()
+        assert values.abs().max() <= fan_in**-0.5
+        assert values.std().item() == pytest.approx(fan_in**-0.5 / 3**0.5, rel=0.1)
+    before = network.weight_0.detach().clone()
+    network.reset_parameters()
+    assert (network.weight_0 != before).float().mean() > 0.99
+
+
+@pytest.mark.parametrize("make", ACTORS)
+@pytest.mark.parametrize("exploration", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
+def test_actions_fill_their_bounds_and_stay_within(make, exploration):
+    torch.manual_seed(0)
+    actor = make(3, SPEC, hidden_sizes=[16])
+    with torch.no_grad(), set_exploration_type(exploration):
+        for parameter in actor.parameters():
+            parameter.mul_(5)
+        actions = actor(states(2000))["action"]
+    assert ((actions >= SPEC.space.low) & (actions <= SPEC.space.high)).all()
+    covered = (actions.amax(0) - actions.amin(0)) / (SPEC.space.high - SPEC.space.low)
+    assert (covered > 0.95).all()
+
+
+def test_the_scale_is_one_at_first_and_is_cut_off():
+    torch.manual_seed(0)
+    actor = make_tanh_gaussian_actor(3, SPEC, log_scale_bounds=(-1.0, 0.5))
+    near = TensorDict({"observation": 0.1 * torch.randn(50, 3)}, [50])
+    torch.testing.assert_close(actor.get_dist(near).scale, torch.ones(50, 2), atol=0.15, rtol=0)
+    with torch.no_grad():
+        for parameter in actor.parameters():
+            parameter.mul_(10)
+    scales = actor.get_dist(states(200)).scale.log()
+    assert scales.min().item() == pytest.approx(-1.0)
+    assert scales.max().item() == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("deactivate_vmap", [False, True])
+def test_torchrl_s_sac_trains_them(deactivate_vmap):
+    torch.manual_seed(0)
+    actor = make_tanh_gaussian_actor(3, SPEC, hidden_sizes=[8])
+    qvalue = make_qvalue_network(3, 2, hidden_sizes=[8])
+    value = make_value_network(3, hidden_sizes=[8])
+    batch = states(
+        6,
+        action=SPEC.rand([6]),
+        next=states(6, reward=torch.randn(6, 1), done=torch.zeros(6, 1, dtype=torch.bool)),
+    )
+    batch["next", "terminated"] = batch["next", "done"].clone()
+    for critics in ([qvalue], [qvalue, value]):
+        loss_module = SACLoss(actor, *critics, deactivate_vmap=deactivate_vmap)
+        SoftUpdate(loss_module, tau=0.1)
+        losses = loss_module(batch)
+        sum(loss for name, loss in losses.items() if name.startswith("loss_")).backward()
+        assert all(
+            parameter.grad is not None and parameter.grad.abs().sum() > 0
+            for parameter in loss_module.parameters()
+        )
+        assert next(actor.parameters()).grad is not None
+
+
+@pytest.mark.parametrize("make", ACTORS)
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        (OneHot(4), "got OneHot. Discrete actions belong to DiscreteECACLoss"),
+        (Bounded(-1.0, 1.0, shape=(5, 2)), r"one vector, got the shape \(5, 2\)"),
+    ],
+)
+def test_other_actions_are_refused(make, spec, message):
+    with pytest.raises(ValueError, match=message):
+        make(3, spec)
+
+
+def test_bounds_of_the_scale_must_be_in_order():
+    with pytest.raises(ValueError, match=r"log_scale_bounds must be \(low, high\), got \(2, -5\)"):
+        make_tanh_gaussian_actor(3, SPEC, log_scale_bounds=(2, -5))

@@ -1,0 +1,149 @@
+"""Sampling actions, and telling kinds of policies apart."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch.distributions import (
+    AffineTransform,
+    Beta,
+    Categorical,
+    Independent,
+    MultivariateNormal,
+    Normal,
+    OneHotCategorical,
+    TanhTransform,
+    TransformedDistribution,
+)
+from torch.testing import assert_close
+from torchrl.modules import IndependentNormal, MaskedCategorical, TanhNormal, TruncatedNormal
+from torchrl.modules import OneHotCategorical as TorchRLOneHotCategorical
+
+from torchrl_ecpo.objectives.actions import (
+    gaussian_parameters,
+    is_discrete,
+    log_prob_of,
+    sample_actions,
+)
+
+LOC = torch.tensor([[0.3, -1.0], [0.0, 2.0], [-0.5, 0.1]], dtype=torch.float64)
+SCALE = torch.tensor([[0.5, 1.0], [0.2, 0.3], [1.5, 0.7]], dtype=torch.float64)
+
+
+def _torch_tanh(loc, scale):
+    base = Independent(Normal(loc, scale), 1)
+    return TransformedDistribution(base, [TanhTransform(), AffineTransform(0.5, 2.5)])
+
+
+GAUSSIAN = {
+    "normal": lambda loc, scale: Independent(Normal(loc, scale), 1),
+    "torchrl_normal": IndependentNormal,
+    "tanh": lambda loc, scale: TanhNormal(loc, scale),
+    "bounded": lambda loc, scale: TanhNormal(loc, scale, low=-2.0, high=3.0),
+    "torch_bounded": _torch_tanh,
+}
+gaussian = pytest.mark.parametrize("kind", GAUSSIAN)
+
+
+@gaussian
+def test_samples_are_those_of_the_policy(kind, dtype):
+    """Shapes, and the same log-probability as by inverting the transform."""
+    policy = GAUSSIAN[kind](LOC.to(dtype), SCALE.to(dtype))
+    torch.manual_seed(0)
+    actions = sample_actions(policy, 5)
+    assert actions.action.shape == actions.latent.shape == (5, 3, 2)
+    assert actions.log_prob.shape == (5, 3)
+    assert {x.dtype for x in actions[:3]} == {dtype}
+    tolerance = {"rtol": 1e-3, "atol": 1e-3} if dtype == torch.float32 else {}
+    assert_close(actions.log_prob, policy.log_prob(actions.action), **tolerance)
+    torch.manual_seed(0)
+    noise = torch.randn(5, 3, 2, dtype=dtype)
+    assert_close(actions.latent, LOC.to(dtype) + SCALE.to(dtype) * noise)
+    expected = {
+        "tanh": actions.latent.tanh(),
+        "bounded": 0.5 + 2.5 * actions.latent.tanh(),
+        "torch_bounded": 0.5 + 2.5 * actions.latent.tanh(),
+    }.get(kind, actions.latent)
+    assert_close(actions.action, expected)
+
+
+@gaussian
+def test_log_prob_under_another_policy(kind):
+    """Of the same transform: its log-volume is that of the samples."""
+    actions = sample_actions(GAUSSIAN[kind](LOC, SCALE), 5)
+    other = GAUSSIAN[kind](LOC + 0.3, SCALE * 1.2)
+    assert_close(log_prob_of(actions, other), other.log_prob(actions.action))
+
+
+@gaussian
+def test_samples_carry_the_gradient(kind):
+    """Of actions, latents and log-probabilities, with respect to both parameters."""
+    loc, scale = LOC.clone().requires_grad_(), SCALE.clone().requires_grad_()
+    actions = sample_actions(GAUSSIAN[kind](loc, scale), 5)
+    for output in actions[:2]:
+        for gradient in torch.autograd.grad(output.sum(), (loc, scale), retain_graph=True):
+            assert gradient.isfinite().all()
+    # A translation moves every sample alike, and the density of a latent not at all.
+    gradient = torch.autograd.grad(actions.latent.sum(), loc)[0]
+    assert_close(gradient, torch.full_like(loc, 5.0))
+
+
+@pytest.mark.parametrize("kind", ["tanh", "bounded"])
+def test_saturated_actions_are_never_inverted(kind, dtype):
+    """tanh(30) is 1: its inverse is not 30, but the log-probability is that of 30."""
+    loc = torch.full((1, 2), 30.0, dtype=dtype)
+    policy = GAUSSIAN[kind](loc, torch.full_like(loc, 1e-3))
+    actions = sample_actions(policy, 4)
+    stretch = math.log(2.5) if kind == "bounded" else 0.0
+    normal = Normal(loc, 1e-3).log_prob(actions.latent)
+    expected = normal - (math.log(4) - 2 * actions.latent) - stretch
+    assert_close(actions.log_prob, expected.sum(-1), rtol=1e-4, atol=1e-3)
+    assert actions.log_prob.isfinite().all()
+
+
+@gaussian
+def test_gaussian_parameters(kind):
+    """Those before the transform."""
+    loc, scale = gaussian_parameters(GAUSSIAN[kind](LOC, SCALE))
+    assert_close((loc, scale), (LOC, SCALE))
+
+
+OTHERS = {
+    "Beta": Independent(Beta(LOC.exp(), SCALE), 1),
+    "MultivariateNormal": MultivariateNormal(LOC, torch.eye(2).double()),
+    "TruncatedNormal": TruncatedNormal(LOC, SCALE),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_policies_that_are_no_diagonal_gaussians(name):
+    """They can be sampled, not centred; the message says what to do."""
+    policy = OTHERS[name]
+    actions = sample_actions(policy, 5)
+    assert_close(actions.log_prob, policy.log_prob(actions.action))
+    assert_close(log_prob_of(actions, policy), actions.log_prob)
+    kind = type(policy).__name__
+    message = f'projection="centred" needs a diagonal Gaussian.*got {kind}.*Use projection="paper"'
+    with pytest.raises(ValueError, match=message):
+        gaussian_parameters(policy)
+
+
+@pytest.mark.parametrize(
+    ("policy", "expected"),
+    [
+        (Categorical(logits=LOC), True),
+        (OneHotCategorical(logits=LOC), True),
+        (TorchRLOneHotCategorical(logits=LOC), True),
+        (MaskedCategorical(logits=LOC, mask=torch.ones(3, 2, dtype=torch.bool)), True),
+        *((make(LOC, SCALE), False) for make in GAUSSIAN.values()),
+        *((policy, False) for policy in OTHERS.values()),
+    ],
+    ids=lambda x: type(x).__name__,
+)
+def test_is_discrete(policy, expected):
+    """Asked of a distribution or of its class."""
+    assert is_discrete(policy) is expected
+    if not isinstance(policy, (Independent, TransformedDistribution)):
+        assert is_discrete(type(policy)) is expected

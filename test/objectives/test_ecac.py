@@ -1,0 +1,615 @@
+"""What is particular to ECAC: closed forms of the lift, exact sums, and the two projections."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from actor_critic_problems import (
+    ACTION,
+    CASES,
+    CHOICES,
+    call,
+    gradients,
+    lift_by_summation,
+    make_batch,
+    make_networks,
+)
+from tensordict import TensorDict
+from tensordict.nn import NormalParamExtractor, TensorDictModule
+from torch import nn
+from torch.distributions import Beta, Categorical, Independent, Normal, kl_divergence
+from torch.testing import assert_close
+from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
+from trajectory_problems import OBSERVATION
+
+from torchrl_ecpo import DiscreteECACLoss, ECACLoss, PeriodicCopy, PolyakAverage
+from torchrl_ecpo.functional import centred_gaussian_projection, mean_seeking_projection
+from torchrl_ecpo.objectives.actions import gaussian_parameters
+
+CASE, DISCRETE = CASES["ecac"], CASES["discrete_ecac"]
+TEMPERATURES = pytest.mark.parametrize(
+    ("tau", "tau_prime"), [(0.5, 0.25), (0.3, 0.0), (0.0, 0.4), (2.0, 5.0)]
+)
+FIXED = {"target_kl": None, "target_entropy": None}
+
+# ------------------------------------------------------------------------- one state, one Gaussian
+
+
+class _Parameters(nn.Module):
+    """A policy's parameters that do not depend on the state."""
+
+    def __init__(self, *parameters: torch.Tensor) -> None:
+        super().__init__()
+        self.parameters_ = nn.ParameterList(parameters)
+
+    def forward(self, observation):
+        return tuple(p.expand(*observation.shape[:-1], -1) for p in self.parameters_)
+
+
+class _Score(nn.Module):
+    """Q as a function of the action alone."""
+
+    def __init__(self, function) -> None:
+        super().__init__()
+        self.function = function
+        self.offset = nn.Parameter(torch.zeros((), dtype=torch.float64))
+
+    def forward(self, observation, action):
+        return self.function(action).sum(-1, keepdim=True) + self.offset
+
+
+def gaussian_bandit(function, loc, scale, *, distribution=IndependentNormal, **options):
+    """A loss for one Gaussian policy and a known Q."""
+    parameters = _Parameters(
+        torch.tensor(loc, dtype=torch.float64), torch.tensor(scale, dtype=torch.float64)
+    )
+    actor = ProbabilisticActor(
+        TensorDictModule(parameters, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=distribution,
+    )
+    qvalue = ValueOperator(_Score(function), ["observation", "action"])
+    loss = ECACLoss(actor, qvalue, num_qvalue_nets=1, delay_qvalue=False, **FIXED, **options)
+    return loss.double()
+
+
+def states(*shape: int) -> TensorDict:
+    """Nothing to see."""
+    observation = torch.zeros(*shape, 1, dtype=torch.float64)
+    return TensorDict({"observation": observation}, batch_size=shape)
+
+
+def lifted(loss, batch, m: int, seed: int = 0):
+    torch.manual_seed(seed)
+    policy = loss._distribution(batch, loss.actor_network_params)
+    return loss.lift(batch, policy, loss.qvalue_network_params, m)
+
+
+LOC, SCALE = (0.3, -0.5), (0.8, 0.4)
+SCORES = {  # slope, curvature: Q = slope a - curvature a^2 / 2
+    "linear": ((0.4, -0.2), (0.0, 0.0)),
+    "quadratic": ((0.4, -0.2), (0.5, 2.0)),
+    "flat": ((0.0, 0.0), (0.0, 0.0)),
+}
+
+
+def _target(name: str, tau: float, tau_prime: float):
+    """pi_bar^(tau/k) exp(Q/k), k = tau + tau': a Gaussian; and the value k log of its integral."""
+    slope, curvature = (torch.tensor(x, dtype=torch.float64) for x in SCORES[name])
+    loc, scale = torch.tensor(LOC).double(), torch.tensor(SCALE).double()
+    total = tau + tau_prime
+    precision = (curvature + tau / scale**2) / total
+    mean = (slope + tau * loc / scale**2) / (total * precision)
+    normaliser = 0.5 * math.log(2 * math.pi) - 0.5 * precision.log() + precision * mean**2 / 2
+    reference = -0.5 * (loc / scale) ** 2 - scale.log() - 0.5 * math.log(2 * math.pi)
+    value = (total * normaliser + tau * reference).sum()
+    return Normal(mean, precision**-0.5), value
+
+
+@pytest.mark.parametrize("name", SCORES)
+@pytest.mark.parametrize(("tau", "tau_prime"), [(0.5, 0.25), (1.0, 0.0), (0.6, 0.05)])
+def test_lift_of_a_gaussian_by_a_quadratic_is_that_gaussian(name, tau, tau_prime):
+    """Mean, variance, soft value and KL(target, pi_bar), within four standard errors."""
+    slope, curvature = (torch.tensor(x, dtype=torch.float64) for x in SCORES[name])
+    loss = gaussian_bandit(
+        lambda a: slope * a - curvature * a**2 / 2, LOC, SCALE, tau=tau, tau_prime=tau_prime
+    )
+    target, value = _target(name, tau, tau_prime)
+    lift = lifted(loss, states(64), 4_000)
+    weights, samples = lift.weights.unsqueeze(-1), lift.sampled_actions.latent
+    mean = (weights * samples).sum(0)
+    variance = (weights * (samples - mean) ** 2).sum(0)
+    reference = Normal(torch.tensor(LOC).double(), torch.tensor(SCALE).double())
+    divergence = (lift.weights * (lift.weights * 4_000).log()).sum(0)
+    for estimate, expected in (
+        (mean, target.mean),
+        (variance, target.variance),
+        (lift.value, value),
+        (divergence, kl_divergence(target, reference).sum()),
+    ):
+        standard_error = estimate.std(0) / math.sqrt(64)
+        assert ((estimate.mean(0) - expected).abs() < 4 * standard_error + 1e-3).all()
+
+
+def test_lift_by_a_linear_score_shifts_the_mean_by_the_slope():
+    """At tau' = 0 by slope sigma^2 / tau, and the width stays: Q is an exponential tilt."""
+    target, value = _target("linear", 2.0, 0.0)
+    slope = torch.tensor(SCORES["linear"][0]).double()
+    loc, scale = torch.tensor(LOC).double(), torch.tensor(SCALE).double()
+    assert_close(target.mean, loc + slope * scale**2 / 2)
+    assert_close(target.stddev, scale)
+    assert_close(value, (slope * loc + slope**2 * scale**2 / 4).sum())
+
+
+@TEMPERATURES
+def test_flat_score_and_no_entropy_leave_the_reference_where_it_is(tau, tau_prime):
+    """Equal weights at tau' = 0; else the target is pi_bar^(tau / (tau + tau'))."""
+    loss = gaussian_bandit(torch.zeros_like, LOC, SCALE, tau=tau, tau_prime=tau_prime)
+    lift = lifted(loss, states(5), 16)
+    if tau_prime == 0:
+        assert_close(lift.weights, torch.full_like(lift.weights, 1 / 16))
+        assert_close(lift.value, torch.zeros(5).double())
+    expected = (-tau_prime / (tau + tau_prime) * lift.reference_log_prob).softmax(0)
+    assert_close(lift.weights, expected)
+
+
+@TEMPERATURES
+def test_uniform_reference(tau, tau_prime):
+    """Of actions in [-1, 1]^2, whose log-density is -2 log 2: weights softmax(Q / (tau + tau'))."""
+
+    class Uniform(nn.Module):
+        def forward(self, observation):
+            ones = torch.ones(*observation.shape[:-1], 2, dtype=observation.dtype)
+            return ones, ones
+
+    class UniformBox(Independent):
+        def __init__(self, one, other) -> None:
+            super().__init__(torch.distributions.Uniform(-one, other, validate_args=False), 1)
+
+    actor = ProbabilisticActor(
+        TensorDictModule(Uniform(), ["observation"], ["one", "other"]),
+        in_keys=["one", "other"],
+        distribution_class=UniformBox,
+    )
+    qvalue = ValueOperator(_Score(lambda a: a**3 + a), ["observation", "action"])
+    loss = ECACLoss(
+        actor,
+        qvalue,
+        num_qvalue_nets=1,
+        delay_qvalue=False,
+        projection="paper",
+        tau=tau,
+        tau_prime=tau_prime,
+        **FIXED,
+    ).double()
+    lift = lifted(loss, states(7), 12)
+    total = tau + tau_prime
+    assert_close(lift.reference_log_prob, torch.full((12, 7), -2 * math.log(2)).double())
+    assert_close(lift.weights, (lift.score / total).softmax(0))
+    log_mean_exp = (lift.score / total).logsumexp(0) - math.log(12)
+    assert_close(lift.value, total * log_mean_exp + tau_prime * 2 * math.log(2))
+
+
+@pytest.mark.parametrize("quantity", ["weights", "value", "kl_target"])
+def test_sampled_lift_converges_to_the_exact_one(quantity):
+    """The root mean square error falls like 1 / sqrt(M): tenfold for a hundred times M."""
+    tau, tau_prime = 0.5, 0.25
+    slope, curvature = (torch.tensor(x, dtype=torch.float64) for x in SCORES["quadratic"])
+    loss = gaussian_bandit(
+        lambda a: slope * a - curvature * a**2 / 2, LOC, SCALE, tau=tau, tau_prime=tau_prime
+    )
+    target, value = _target("quadratic", tau, tau_prime)
+    reference = Normal(torch.tensor(LOC).double(), torch.tensor(SCALE).double())
+    errors = []
+    for m in (20, 2_000):
+        lift = lifted(loss, states(400), m)
+        estimate, expected = {
+            "weights": (
+                (lift.weights.unsqueeze(-1) * lift.sampled_actions.latent).sum(0),
+                target.mean,
+            ),
+            "value": (lift.value, value),
+            "kl_target": (
+                loss._metrics(lift, *[loss._policies(states(400))[0]] * 2)["kl_target"],
+                kl_divergence(target, reference).sum(),
+            ),
+        }[quantity]
+        errors.append((estimate - expected).square().mean().sqrt().item())
+    assert 7 < errors[0] / errors[1] < 14
+    assert errors[1] < 0.03
+
+
+# --------------------------------------------------------------------------------- the projections
+
+
+@pytest.mark.parametrize("projection", ["centred", "paper"])
+@pytest.mark.parametrize("kind", ["tanh_normal", "normal", "bounded"])
+def test_projection_is_the_function_of_that_name(projection, kind):
+    """On the pre-tanh samples; with the paper's the log-volume adds a constant."""
+    networks = make_networks(kind)
+    loss = CASE.build(networks, projection=projection, reduction="none")
+    batch = make_batch(kind)
+    policy = loss._distribution(batch, loss.actor_network_params)
+    torch.manual_seed(0)
+    actual, lift = loss.project(batch, policy, policy)
+    actions = lift.sampled_actions
+    if projection == "centred":
+        expected = centred_gaussian_projection(
+            *gaussian_parameters(policy), actions.latent, lift.log_weights, sample_dim=0
+        ).loss
+    else:
+        log_prob = policy.log_prob(actions.action)
+        expected = mean_seeking_projection(log_prob, lift.log_weights, sample_dim=0).loss
+    assert_close(actual, expected)
+
+
+@pytest.mark.parametrize("kind", ["tanh_normal", "normal", "bounded"])
+def test_projections_share_the_gradient_of_the_mean(kind):
+    """And differ in that of the scale."""
+    grads, batch = {}, make_batch(kind)
+    for projection in ("centred", "paper"):
+        loss = CASE.build(make_networks(kind), projection=projection)
+        outputs = call(loss, batch)
+        bias = gradients(loss, outputs["loss_actor"])
+        grads[projection] = next(g for name, g in bias.items() if name.endswith("0.bias"))
+    assert_close(grads["centred"][:ACTION], grads["paper"][:ACTION])
+    assert (grads["centred"][ACTION:] - grads["paper"][ACTION:]).abs().min() > 1e-3
+
+
+@pytest.mark.parametrize("projection", ["centred", "paper"])
+def test_gradient_vanishes_at_the_projection(projection):
+    """A delayed reference, and a policy that is the lift of it already."""
+    tau, tau_prime = 0.5, 0.25
+    slope, curvature = (torch.tensor(x, dtype=torch.float64) for x in SCORES["quadratic"])
+    target, _ = _target("quadratic", tau, tau_prime)
+
+    def gradient(loc, scale):
+        loss = gaussian_bandit(
+            lambda a: slope * a - curvature * a**2 / 2,
+            LOC,
+            SCALE,
+            tau=tau,
+            tau_prime=tau_prime,
+            projection=projection,
+            delay_actor=True,
+            num_action_samples=64,
+        )
+        PeriodicCopy(loss, "actor_network", interval=1_000)
+        for parameter, value in zip(loss.actor_network.parameters(), (loc, scale), strict=True):
+            parameter.data.copy_(value)
+        torch.manual_seed(0)
+        batch = states(2_000)
+        divergence, _ = loss.project(batch, *loss._policies(batch))
+        return torch.stack(
+            torch.autograd.grad(divergence.mean(), list(loss.actor_network.parameters()))
+        )
+
+    there = gradient(target.mean, target.stddev)
+    elsewhere = gradient(target.mean + 0.3, 1.3 * target.stddev)
+    assert there.norm() < 0.05 * elsewhere.norm()
+
+
+def test_a_tanh_policy_is_projected_as_the_gaussian_below_it():
+    """With Q(tanh u) for Q(u): at tau' = 0 the Jacobian is in none of the weights."""
+    options = {"tau": 0.4, "tau_prime": 0.0}
+    outputs = []
+    for distribution, function in ((TanhNormal, lambda a: a**2), (IndependentNormal, None)):
+        loss = gaussian_bandit(
+            function or (lambda u: u.tanh() ** 2), LOC, SCALE, distribution=distribution, **options
+        )
+        batch = states(6)
+        torch.manual_seed(0)
+        divergence, lift = loss.project(batch, *loss._policies(batch))
+        grads = torch.autograd.grad(divergence.sum(), list(loss.actor_network.parameters()))
+        outputs.append((divergence, lift.weights, *grads))
+    assert_close(*outputs)
+
+
+def _beta_actor():
+    network = nn.Sequential(nn.Linear(OBSERVATION, 2 * ACTION), NormalParamExtractor()).double()
+
+    class PositiveBeta(Independent):
+        def __init__(self, loc, scale) -> None:
+            super().__init__(Beta(loc.exp(), scale), 1)
+
+    return ProbabilisticActor(
+        TensorDictModule(network, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=PositiveBeta,
+    )
+
+
+def test_policy_that_is_no_gaussian():
+    """The paper's projection takes it; the centred one says so, and what to do."""
+    networks = make_networks()
+    networks.actor = _beta_actor()
+    message = 'projection="centred" needs a diagonal Gaussian policy.*Use projection="paper"'
+    with pytest.raises(ValueError, match=message):
+        CASE.build(networks)(make_batch())
+    networks.actor = _beta_actor()
+    loss = CASE.build(networks, projection="paper")
+    outputs = call(loss, make_batch())
+    assert all(output.isfinite() for output in outputs.values())
+    grads = gradients(loss, outputs["loss_actor"])
+    assert any(g.abs().max() > 0 for name, g in grads.items() if "actor" in name)
+
+
+def test_unknown_projection():
+    message = r"projection must be one of \('centred', 'paper'\), got 'literal'"
+    with pytest.raises(ValueError, match=message):
+        CASE.build(projection="literal")
+
+
+def test_saturation_is_of_the_range_of_the_actions():
+    """The outer 5 % of it; none without a range."""
+    saturation = {}
+    for kind in ("tanh_normal", "bounded", "normal"):
+        networks = make_networks(kind)
+        networks.actor[0].module[0].bias.data[:ACTION] = 2.0  # type: ignore
+        saturation[kind] = call(CASE.build(networks), make_batch(kind))["saturation"]
+    assert saturation["tanh_normal"] == saturation["bounded"]
+    assert 0.2 < saturation["bounded"] < 1
+    assert saturation["normal"] == 0
+
+
+def test_the_least_of_the_soft_q_values_counts():
+    """In the lift, of each action by itself."""
+    networks = make_networks()
+    loss = CASE.build(networks)
+    batch = make_batch()
+    lift = lifted(loss, batch, 50)
+    each = []
+    for qvalue in networks.qvalues:
+        inputs = TensorDict(
+            {
+                "observation": batch["observation"].expand(50, 6, -1),
+                "action": lift.sampled_actions.action,
+            },
+            batch_size=[50, 6],
+        )
+        each.append(qvalue(inputs)["state_action_value"].squeeze(-1))
+    assert_close(lift.score, torch.stack(each).amin(0).detach())
+    first_is_less = each[0] < each[1]
+    assert first_is_less.any()
+    assert not first_is_less.all()
+
+
+def test_several_actions_at_the_next_state():
+    """The log-mean-exp above Eq. 9; with one the paper's estimate."""
+    batch = make_batch()
+    batch["next", "reward"].zero_()
+    batch["next", "terminated"].zero_()
+    for n in (1, 5):
+        loss = CASE.build(num_next_action_samples=n)
+        torch.manual_seed(0)
+        target = loss.soft_bellman_target(batch) / 0.9
+        following = batch["next"].select("observation")
+        torch.manual_seed(0)
+        policy = loss._distribution(following, loss.actor_network_params)
+        lift = loss.lift(following, policy, loss.target_qvalue_network_params, n)
+        total = CASE.tau + CASE.tau_prime
+        weights = (lift.score - CASE.tau_prime * lift.reference_log_prob) / total
+        assert_close(target, total * weights.exp().mean(0).log())
+        if n == 1:
+            assert_close(target, (lift.score - CASE.tau_prime * lift.reference_log_prob)[0])
+
+
+def test_defaults():
+    """Both temperatures are learned, from where the documentation says."""
+    networks = make_networks()
+    loss = ECACLoss(networks.actor, networks.qvalues)
+    PolyakAverage(loss)
+    outputs = call(loss, make_batch())
+    assert_close((outputs["tau"], outputs["tau_prime"]), (torch.tensor(0.3), torch.tensor(0.1)))
+    assert (loss.target_kl, loss.target_entropy, loss.projection) == (0.083, "auto", "centred")
+    assert (loss.num_action_samples, loss.num_next_action_samples) == (8, 1)
+    assert (loss.min_tau, loss.min_tau_prime) == (0.001, 0.003)
+    networks = make_networks("categorical")
+    loss = DiscreteECACLoss(networks.actor, networks.qvalues)
+    PolyakAverage(loss)
+    outputs = call(loss, make_batch("categorical"))
+    assert_close((outputs["tau"], outputs["tau_prime"]), (torch.tensor(0.3), torch.tensor(0.1)))
+    assert (loss.target_kl, loss.target_entropy) == (0.1, None)
+
+
+# ------------------------------------------------------------------------------- discrete, by hand
+
+
+class _Table(nn.Module):
+    """A row for each state; states are observed as one-hot vectors."""
+
+    def __init__(self, rows) -> None:
+        super().__init__()
+        self.rows = nn.Parameter(torch.tensor(rows, dtype=torch.float64))
+
+    def forward(self, observation):
+        return observation @ self.rows
+
+
+def tabular(logits, *tables, **options):
+    """Of a policy and two tables of Q, or twice the same one."""
+    actor = ProbabilisticActor(
+        TensorDictModule(_Table(logits), ["observation"], ["logits"]),
+        in_keys=["logits"],
+        distribution_class=Categorical,
+    )
+    first, second = tables * 2 if len(tables) == 1 else tables
+    qvalues = [
+        TensorDictModule(_Table(t), ["observation"], ["action_value"]) for t in (first, second)
+    ]
+    loss = DiscreteECACLoss(actor, qvalues, delay_qvalue=False, **FIXED, **options)
+    return loss.make_value_estimator(gamma=0.5).double()
+
+
+def transition(state: int, action: int, reward: float, following: int, *, terminated=False):
+    """In a problem of two states."""
+    rows = torch.eye(2, dtype=torch.float64)
+    end = torch.tensor([[terminated]])
+    return TensorDict(
+        {
+            "observation": rows[state : state + 1],
+            "action": torch.tensor([action]),
+            "next": {
+                "observation": rows[following : following + 1],
+                "reward": torch.tensor([[reward]], dtype=torch.float64),
+                "done": end,
+                "terminated": end.clone(),
+            },
+        },
+        batch_size=[1],
+    )
+
+
+def test_discrete_lift_and_losses_by_hand():
+    """tau = tau' = 1, pi_bar = (1/4, 3/4), min Q = (2 log 2, 2 log 3), in the first state."""
+    log = math.log
+    loss = tabular(
+        [[log(1), log(3)], [0.0, 0.0]],
+        [[2 * log(2), 2 * log(3)], [0.0, 2 * log(3)]],
+        [[2 * log(2) + 1, 2 * log(3) + 1], [7.0, 7.0]],
+        tau=1.0,
+        tau_prime=1.0,
+    )
+    batch = transition(0, 1, 10.0, 1)
+    outputs = loss(batch)
+    # exp((Q + log pi_bar) / 2) = 2 * 1/2, 3 * sqrt(3)/2
+    first, second = 1.0, 1.5 * math.sqrt(3)
+    target = torch.tensor([first, second], dtype=torch.float64) / (first + second)
+    assert_close(outputs["state_value"].item(), 2 * log(first + second))
+    cross_entropy = -target[0] * log(1 / 4) - target[1] * log(3 / 4)
+    assert_close(outputs["loss_actor"], cross_entropy)
+    assert_close(outputs["entropy"].item(), log(4) - 0.75 * log(3))
+    divergence = target[0] * (4 * target[0]).log() + target[1] * (4 / 3 * target[1]).log()
+    assert_close(outputs["kl_target"], divergence)
+    assert_close(outputs["qvalue"].item(), log(2) + log(3))
+    # V(second state) = 2 log((1 + 3) / sqrt(2)), at gamma = 1/2; Q of the action is 2 log 3 (+ 1)
+    bellman = 10 + 0.5 * 2 * log(4 / math.sqrt(2))
+    errors = [2 * log(3) - bellman, 2 * log(3) + 1 - bellman]
+    assert_close(outputs["loss_qvalue"].item(), sum(error**2 for error in errors))
+    assert_close(batch["td_error"].item(), -errors[0])
+    ended = transition(0, 1, 10.0, 1, terminated=True)
+    loss(ended)
+    assert_close(ended["td_error"].item(), 10 - 2 * log(3))
+
+
+@TEMPERATURES
+def test_discrete_uniform_reference(tau, tau_prime):
+    """Weights softmax(Q / (tau + tau')), value that of Q's log-sum-exp less tau log n."""
+    score = [[0.3, -0.2, 1.0], [0.0, 0.0, 0.0]]
+    loss = tabular([[0.0] * 3] * 2, score, tau=tau, tau_prime=tau_prime)
+    batch = transition(0, 1, 0.0, 1)
+    lift = lifted(loss, batch.select("observation"), 0)
+    total = tau + tau_prime
+    score = torch.tensor(score[0], dtype=torch.float64)
+    assert_close(lift.weights[:, 0], (score / total).softmax(0))
+    expected = total * (score / total).logsumexp(0) - tau * math.log(3)
+    assert_close(lift.value[0], expected)
+
+
+@TEMPERATURES
+def test_discrete_gradient_is_policy_minus_target(tau, tau_prime):
+    """With respect to the logits; at a delayed reference as well as at the policy itself."""
+    networks = make_networks("categorical")
+    for delay in (False, True):
+        loss = DISCRETE.build(
+            networks, tau=tau, tau_prime=tau_prime, delay_actor=delay, reduction="sum"
+        )
+        batch = make_batch("categorical")
+        value = loss(batch)["loss_actor"]
+        bias = next(g for name, g in gradients(loss, value).items() if name.endswith("0.bias"))
+        target = lift_by_summation(
+            networks.actor, networks.qvalues, batch["observation"], tau=tau, tau_prime=tau_prime
+        ).weights
+        probability = networks.actor.get_dist(batch).probs.detach().movedim(-1, 0)
+        assert_close(bias, (probability - target).sum(-1))
+
+
+@pytest.mark.parametrize("name", ["discrete_ecac", "discrete_pmd_ac"])
+def test_both_projections_arrive_at_the_lift(name):
+    """From a fixed reference, by gradient descent in a table."""
+    case = CASES[name]
+    kind = "categorical"
+    networks = make_networks(kind)
+    table = _Table([[0.5, -0.5, 0.1, 0.0]] * OBSERVATION)
+    networks.actor[0].module = table
+    loss = case.build(networks, updater=False, delay_actor=True, delay_qvalue=False)
+    PeriodicCopy(loss, "actor_network", interval=10_000)
+    batch = make_batch(kind)[:1]
+    target = lift_by_summation(
+        networks.actor, networks.qvalues, batch["observation"], tau=0.75, tau_prime=0.25
+    )
+    optimizer = torch.optim.LBFGS(
+        networks.actor.parameters(), max_iter=50, line_search_fn="strong_wolfe"
+    )
+
+    def closure():
+        optimizer.zero_grad()
+        value = loss(batch)["loss_actor"]
+        value.backward()
+        return value
+
+    optimizer.step(closure)
+    outputs = loss(batch)
+    policy = networks.actor.get_dist(batch)
+    assert_close(policy.probs[0].detach(), target.weights[:, 0], atol=1e-4, rtol=0)
+    assert_close(outputs["state_value"], target.value[0])
+    divergence = (target.weights * (target.weights.log() - target.reference)).sum()
+    assert_close(outputs["kl_target"], divergence)
+    reverse = (target.reference.exp() * (target.reference - target.weights.log())).sum()
+    assert_close(outputs["kl_to_reference"], reverse, atol=1e-4, rtol=0)
+
+
+def test_soft_values_of_a_tabular_problem_are_a_fixed_point():
+    """Two states, known transitions: Q learned by the loss is Bellman's, and V Eq. 8's."""
+    loss = tabular([[0.2, -0.4], [0.0, 0.3]], [[0.0, 0.0], [0.0, 0.0]], tau=0.3, tau_prime=0.2)
+    dynamics = [(0, 0, 1.0, 1), (0, 1, 0.0, 0), (1, 0, -1.0, 0), (1, 1, 0.5, 1)]
+    batch = torch.cat([transition(*arguments) for arguments in dynamics])
+    optimizer = torch.optim.SGD(loss.qvalue_network_params.parameters(), 1.0)
+    for _ in range(80):
+        loss(batch)["loss_qvalue"].backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    reference = torch.tensor([[0.2, -0.4], [0.0, 0.3]]).double().log_softmax(-1)
+    qvalue = torch.zeros(2, 2, dtype=torch.float64)
+    for _ in range(100):
+        value = 0.5 * ((qvalue + 0.3 * reference) / 0.5).exp().sum(-1).log()
+        for state, action, reward, following in dynamics:
+            qvalue[state, action] = reward + 0.5 * value[following]
+    learned = loss.qvalue_network_params["module", "rows"][0].detach()
+    assert_close(learned, qvalue, atol=1e-6, rtol=0)
+    assert_close(loss(batch)["state_value"], value.mean(), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["discrete_ecac", "discrete_pmd_ac"])
+def test_actions_by_number_and_one_hot(name):
+    """All forms of the same action give the same losses."""
+    case = CASES[name]
+    batch = make_batch("categorical")
+    loss = case.build()
+    number = batch["action"]
+    outputs = []
+    for action in (
+        number,
+        number.unsqueeze(-1),
+        number.int(),
+        nn.functional.one_hot(number, CHOICES),
+        nn.functional.one_hot(number, CHOICES).double(),
+        nn.functional.one_hot(number, CHOICES).bool(),
+    ):
+        outputs.append(call(loss, batch.set("action", action)))
+    for other in outputs[1:]:
+        assert_close(other, outputs[0])
+
+
+@pytest.mark.parametrize("name", ["discrete_ecac", "discrete_pmd_ac"])
+def test_actions_of_no_probability(name):
+    """Masked logits: no NaN, no weight, no gradient from the action that cannot be."""
+    case = CASES[name]
+    networks = make_networks(case.kind)
+    networks.actor[0].module[0].bias.data[2] = -1e9  # type: ignore
+    loss = case.build(networks, delay_actor=True)
+    outputs = call(loss, make_batch(case.kind))
+    assert all(output.isfinite() for output in outputs.values())
+    assert all(g.isfinite().all() for g in gradients(loss, outputs["loss_actor"]).values())

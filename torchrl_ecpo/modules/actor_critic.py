@@ -1,0 +1,259 @@
+"""Feed-forward actors and critics for continuous actions.
+
+All networks are multi-layer perceptrons with ReLU; by default two layers of 256 units, the usual
+size for SAC and TD3 on the MuJoCo tasks. They read ``observation``; an actor writes ``action``
+within the bounds of its specification.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+    TensorDictSequential,
+    dispatch,
+)
+from torch import Tensor, nn
+from torch.nn.functional import linear
+from torchrl.data import Bounded, TensorSpec
+from torchrl.modules import ProbabilisticActor, TanhModule, TanhNormal
+
+__all__ = [
+    "DenseNetwork",
+    "make_deterministic_actor",
+    "make_qvalue_network",
+    "make_tanh_gaussian_actor",
+    "make_value_network",
+]
+
+HIDDEN_SIZES = (256, 256)
+LOG_SCALE_BOUNDS = (-5.0, 2.0)
+
+
+class DenseNetwork(TensorDictModuleBase):
+    """A multi-layer perceptron with ReLU, from entries of a TensorDict to entries of it.
+
+    It computes what ``TensorDictModule(MLP(...))`` does. The update of an actor-critic calls its
+    networks eight times on small batches and swaps their parameters each time, so what surrounds
+    the matrix products counts: here all parameters belong to one module, and outputs are written as
+    they are. That saves about a seventh of the time of an update by ``SACLoss``.
+
+    Args:
+        in_keys: entries to read, ``[..., n]`` each; they are concatenated.
+        out_keys: entries to write.
+        sizes: units of each layer, that of the inputs first.
+        head: from the output of the last layer to the tuple of entries; by default it is the one
+            entry.
+
+    Examples:
+        >>> import torch
+        >>> network = DenseNetwork(["observation"], ["state_value"], [3, 8, 1])
+        >>> network(observation=torch.zeros(5, 3)).shape
+        torch.Size([5, 1])
+    """
+
+    def __init__(
+        self,
+        in_keys: Sequence[Any],
+        out_keys: Sequence[Any],
+        sizes: Sequence[int],
+        head: Callable[[Tensor], tuple[Tensor, ...]] | None = None,
+    ) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = list(in_keys), list(out_keys)
+        self.sizes = tuple(sizes)
+        self.head = head
+        self._names = [(f"weight_{i}", f"bias_{i}") for i in range(len(sizes) - 1)]
+        for (weight, bias), fan_in, fan_out in zip(self._names, sizes, sizes[1:], strict=False):
+            self.register_parameter(weight, nn.Parameter(torch.empty(fan_out, fan_in)))
+            self.register_parameter(bias, nn.Parameter(torch.empty(fan_out)))
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Draw all parameters anew, as ``torch.nn.Linear`` does: uniform up to 1/sqrt(fan-in)."""
+        for (weight, bias), fan_in in zip(self._names, self.sizes, strict=False):
+            for name in (weight, bias):
+                nn.init.uniform_(getattr(self, name), -(fan_in**-0.5), fan_in**-0.5)
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the outputs into ``tensordict``."""
+        inputs = [tensordict.get(key) for key in self.in_keys]
+        x = torch.cat(inputs, -1) if len(inputs) > 1 else inputs[0]
+        for weight, bias in self._names[:-1]:
+            x = torch.relu(linear(x, getattr(self, weight), getattr(self, bias)))
+        weight, bias = self._names[-1]
+        x = linear(x, getattr(self, weight), getattr(self, bias))
+        outputs = (x,) if self.head is None else self.head(x)
+        for key, output in zip(self.out_keys, outputs, strict=True):
+            tensordict.set(key, output)
+        return tensordict
+
+
+def _loc_and_scale(
+    output: Tensor, log_scale_bounds: tuple[float, float] = LOG_SCALE_BOUNDS
+) -> tuple[Tensor, Tensor]:
+    """Split a network's output into the location and the scale of a Gaussian.
+
+    The second half of the output is the logarithm of the scale, cut off at the bounds. An untrained
+    network, whose outputs are near 0, gives a scale of about 1.
+
+    Args:
+        output: ``[..., 2 * A]``.
+        log_scale_bounds: the least and the greatest logarithm of the scale.
+
+    Returns:
+        Location and scale, ``[..., A]`` each.
+
+    Examples:
+        >>> import torch
+        >>> _loc_and_scale(torch.tensor([0.5, -0.5, 0.0, 9.0]))
+        (tensor([ 0.5000, -0.5000]), tensor([1.0000, 7.3891]))
+    """
+    loc, log_scale = output.chunk(2, -1)
+    return loc, log_scale.clamp(*log_scale_bounds).exp()
+
+
+def make_tanh_gaussian_actor(
+    observation_size: int,
+    action_spec: TensorSpec,
+    *,
+    hidden_sizes: Sequence[int] = HIDDEN_SIZES,
+    log_scale_bounds: tuple[float, float] = LOG_SCALE_BOUNDS,
+) -> ProbabilisticTensorDictSequential:
+    """A stochastic policy: a Gaussian, squashed by tanh into the bounds of the actions.
+
+    Args:
+        observation_size: length of an observation vector.
+        action_spec: of one environment, bounded, ``[A]``.
+
+    Keyword Args:
+        hidden_sizes: units of each hidden layer.
+        log_scale_bounds: of the Gaussian before tanh. Default: (-5, 2); 2 is SAC's, its -20 is
+            never reached, and a scale of e^-5 acts like none.
+
+    Raises:
+        ValueError: if the actions are not vectors of bounded numbers, or if the bounds of the scale
+            are not in order.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> actor = make_tanh_gaussian_actor(3, Bounded(-2.0, 2.0, shape=(1,)))
+        >>> state = actor(TensorDict({"observation": torch.zeros(5, 3)}, batch_size=[5]))
+        >>> state["action"].shape, bool((state["action"].abs() <= 2).all())
+        (torch.Size([5, 1]), True)
+    """
+    spec = _bounded(action_spec)
+    low, high = log_scale_bounds
+    if not low < high:
+        raise ValueError(f"log_scale_bounds must be (low, high), got {log_scale_bounds}.")
+    network: Any = DenseNetwork(
+        ["observation"],
+        ["loc", "scale"],
+        [observation_size, *hidden_sizes, 2 * spec.shape[-1]],
+        partial(_loc_and_scale, log_scale_bounds=log_scale_bounds),
+    )
+    return ProbabilisticActor(
+        network,
+        in_keys=["loc", "scale"],
+        spec=spec,
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": spec.space.low, "high": spec.space.high},
+    )
+
+
+def make_deterministic_actor(
+    observation_size: int,
+    action_spec: TensorSpec,
+    *,
+    hidden_sizes: Sequence[int] = HIDDEN_SIZES,
+) -> TensorDictSequential:
+    """A deterministic policy, for TD3 and DDPG: tanh, scaled to the bounds of the actions.
+
+    Args:
+        observation_size: length of an observation vector.
+        action_spec: of one environment, bounded, ``[A]``.
+
+    Keyword Args:
+        hidden_sizes: units of each hidden layer.
+
+    Raises:
+        ValueError: if the actions are not vectors of bounded numbers.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> actor = make_deterministic_actor(3, Bounded(-2.0, 2.0, shape=(1,)))
+        >>> actor(TensorDict({"observation": torch.zeros(5, 3)}, batch_size=[5]))["action"].shape
+        torch.Size([5, 1])
+    """
+    spec = _bounded(action_spec)
+    sizes = [observation_size, *hidden_sizes, spec.shape[-1]]
+    network: Any = DenseNetwork(["observation"], ["pre_tanh"], sizes)
+    squash: Any = TanhModule(in_keys=["pre_tanh"], out_keys=["action"], spec=spec)
+    return TensorDictSequential(network, squash)
+
+
+def make_qvalue_network(
+    observation_size: int, action_size: int, *, hidden_sizes: Sequence[int] = HIDDEN_SIZES
+) -> DenseNetwork:
+    """Q(s, a): reads ``observation`` and ``action``, writes ``state_action_value`` ``[..., 1]``.
+
+    Args:
+        observation_size: length of an observation vector.
+        action_size: length A of an action vector.
+
+    Keyword Args:
+        hidden_sizes: units of each hidden layer.
+
+    Examples:
+        >>> import torch
+        >>> qvalue = make_qvalue_network(3, 2)
+        >>> qvalue(observation=torch.zeros(5, 3), action=torch.zeros(5, 2)).shape
+        torch.Size([5, 1])
+    """
+    sizes = [observation_size + action_size, *hidden_sizes, 1]
+    return DenseNetwork(["observation", "action"], ["state_action_value"], sizes)
+
+
+def make_value_network(
+    observation_size: int, *, hidden_sizes: Sequence[int] = HIDDEN_SIZES
+) -> DenseNetwork:
+    """V(s): reads ``observation``, writes ``state_value`` ``[..., 1]``.
+
+    Args:
+        observation_size: length of an observation vector.
+
+    Keyword Args:
+        hidden_sizes: units of each hidden layer.
+
+    Examples:
+        >>> import torch
+        >>> make_value_network(3)(observation=torch.zeros(5, 3)).shape
+        torch.Size([5, 1])
+    """
+    return DenseNetwork(["observation"], ["state_value"], [observation_size, *hidden_sizes, 1])
+
+
+def _bounded(action_spec: TensorSpec) -> Any:
+    """The specification, if it is one of vectors of bounded numbers."""
+    if not isinstance(action_spec, Bounded) or not action_spec.dtype.is_floating_point:
+        raise ValueError(
+            "action_spec must be of bounded continuous actions (torchrl's Bounded), got "
+            f"{type(action_spec).__name__}. Discrete actions belong to DiscreteECACLoss."
+        )
+    if len(action_spec.shape) != 1:
+        raise ValueError(
+            f"action_spec must be of one vector, got the shape {tuple(action_spec.shape)}: take "
+            "`env.action_spec_unbatched`."
+        )
+    return action_spec

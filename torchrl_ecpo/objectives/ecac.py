@@ -1,0 +1,325 @@
+"""Exploratory Conservative Actor-Critic."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from torch import Tensor
+from torch.distributions import Distribution
+
+from torchrl_ecpo.functional import centred_gaussian_projection, mean_seeking_projection
+from torchrl_ecpo.objectives.actions import gaussian_parameters, log_prob_of
+from torchrl_ecpo.objectives.actor_critic import (
+    ContinuousActorCriticLoss,
+    DiscreteActorCriticLoss,
+    Lift,
+    log_probs_of_all,
+)
+
+__all__ = ["DiscreteECACLoss", "ECACLoss"]
+
+PROJECTIONS = ("centred", "paper")
+
+
+class ECACLoss(ContinuousActorCriticLoss):
+    r"""ECAC for continuous actions: lift the reference policy by soft Q, project mean-seeking.
+
+    "On Principled Entropy Exploration in Policy Optimization", Mei et al., IJCAI 2019, Eq. 8 to 11.
+    With M actions of the reference policy at each state,
+
+    .. math::
+        L(\theta) = -\sum_m w_m \log \pi_\theta(a_m|s), \quad
+        w = \mathrm{softmax}_m \frac{Q(s, a_m) - \tau' \log \bar\pi(a_m|s)}{\tau + \tau'}, \quad
+        a_m \sim \bar\pi(\cdot|s)
+
+    ``ECACLoss(actor, qvalue)`` takes the place of ``SACLoss(actor, qvalue)``: the same networks and
+    entries, another way for the policy to follow Q.
+
+    Args:
+        actor_network: a policy with ``get_dist``: a Gaussian or tanh-Gaussian one for
+            ``projection="centred"``, any with ``rsample`` for ``"paper"``. Actions are ``[*B, A]``.
+        qvalue_network: reads observation and action, writes ``"state_action_value"`` ``[*B, 1]``.
+            A list gives the networks one by one.
+        value_network: reads the observation, writes ``"state_value"`` ``[*B, 1]``. With it, the
+            value of the next state is that of its delayed copy (the paper, Eq. 9); without
+            (default), it is computed from delayed Q and the reference policy (Eq. 8), which learned
+            faster in our runs.
+
+    Keyword Args:
+        tau: temperature of the divergence from the reference, in the unit of Q. Where it is
+            learned, where it starts. Default: 0.3.
+        tau_prime: temperature of the entropy, likewise. Default: 0.1.
+        target_kl: KL(target, pi_bar) per action dimension, in nats, that tau is learned to hold
+            (``loss_tau``, parameter ``log_tau``). It must be below log M / A. None: tau is
+            fixed, or scheduled by assignment. Default: 0.083, half a nat for six dimensions.
+        target_entropy: entropy in nats that tau_prime is learned to hold (``loss_tau_prime``,
+            parameter ``log_tau_prime``), as SAC's alpha is; ``"auto"`` (default, SAC's) is -A.
+            None: tau_prime is fixed, or scheduled by assignment.
+        min_tau: floor of a learned tau. Default: 0.001.
+        min_tau_prime: floor of a learned tau_prime. Without one it winds down to nothing while
+            the policy lags behind its target. Default: 0.003.
+        projection: ``"centred"`` (default): the scale is fitted to the variance about the samples'
+            own mean, :func:`~torchrl_ecpo.functional.centred_gaussian_projection`. ``"paper"``:
+            Eq. 11 to the letter.
+        num_qvalue_nets: the least of so many soft Q values counts. Default: 2 (the paper's).
+        num_actor_states: the policy, the value network and the temperatures learn from the first so
+            many entries of the batch only, which saves time where M is large. Default: None, all.
+        num_action_samples: M. Default: 8.
+        num_next_action_samples: actions at the next state, from which its value is computed where
+            there is no value network. Default: 1 (the paper's estimate).
+        loss_function: ``"l2"`` (default; Eq. 9 and 10 without their factor 1/2), ``"l1"`` or
+            ``"smooth_l1"``.
+        delay_actor: if True, the reference policy is ``target_actor_network_params``, to be moved
+            by an updater (:class:`~torchrl_ecpo.PeriodicCopy`). If False (default), it is the
+            policy of this very update: one step a lift.
+        delay_qvalue: whether the next state's value comes from delayed Q networks. Default: True,
+            or False with a value network.
+        delay_value: must be True: a value network without delay diverges.
+        separate_losses: if True, parameters shared with the actor are trained by ``loss_actor``
+            alone. Default: False.
+        reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
+        skip_done_states: if True, next states that are ``done`` are never looked at and count
+            nothing, also those of a time limit. Default: False; nothing is expected after
+            ``terminated`` states in either case, whatever stands there.
+        use_prioritized_weights: whether losses are weighted by the entry ``"priority_weight"``;
+            ``"auto"`` (default): if it is there.
+        deactivate_vmap: if True, the Q networks are called one after another. Default: False.
+
+    The outputs are ``loss_actor``, ``loss_qvalue``, ``loss_value`` (with a value network),
+    ``loss_tau`` and ``loss_tau_prime`` (where learned), each reaching its own parameters only, so
+    that their sum can be backpropagated at once; and, detached, ``ESS`` of the weights,
+    ``kl_target`` = KL(target, pi_bar), ``kl_to_reference`` = KL(pi_bar, pi_theta), ``entropy`` of
+    the reference, ``saturation`` (share of action components in the outer 5 % of their range),
+    ``qvalue``, ``state_value``, ``tau`` and ``tau_prime``. The temporal difference error is written
+    into the input as ``"td_error"``, 0 where the entry ``("collector", "mask")`` says that a
+    transition is not real: such transitions are not looked at, whatever stands there.
+
+    Raises:
+        ValueError: for discrete actions, a Q network that reads no action, a value network without
+            delay, no samples, temperatures that are not allowed, a target_kl that M samples cannot
+            show, an unknown option; when called, for NaN or infinite values.
+        TypeError: if ``actor_network`` has no ``get_dist``.
+        KeyError: when called, for a missing entry.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
+        >>> from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+        >>> from torchrl_ecpo import PolyakAverage
+        >>> net = torch.nn.Sequential(torch.nn.Linear(3, 4), NormalParamExtractor())
+        >>> module = TensorDictModule(net, ["observation"], ["loc", "scale"])
+        >>> actor = ProbabilisticActor(module, ["loc", "scale"], distribution_class=TanhNormal)
+        >>> qvalue = ValueOperator(
+        ...     MLP(in_features=5, out_features=1, num_cells=[8]), ["observation", "action"])
+        >>> loss_module = ECACLoss(actor, qvalue)
+        >>> updater = PolyakAverage(loss_module, "qvalue_network")
+        >>> batch = TensorDict({
+        ...     "observation": torch.randn(5, 3),
+        ...     "action": torch.rand(5, 2) * 2 - 1,
+        ...     "next": {
+        ...         "observation": torch.randn(5, 3),
+        ...         "reward": torch.rand(5, 1),
+        ...         "done": torch.zeros(5, 1, dtype=torch.bool),
+        ...         "terminated": torch.zeros(5, 1, dtype=torch.bool),
+        ...     },
+        ... }, batch_size=[5])
+        >>> losses = loss_module(batch)
+        >>> sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+        >>> updater.step()
+    """
+
+    _twin = "DiscreteECACLoss"
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        qvalue_network: TensorDictModule | list[TensorDictModule],
+        value_network: TensorDictModule | None = None,
+        *,
+        tau: float = 0.3,
+        tau_prime: float = 0.1,
+        target_kl: float | None = 0.083,
+        target_entropy: float | Literal["auto"] | None = "auto",
+        min_tau: float = 0.001,
+        min_tau_prime: float = 0.003,
+        projection: Literal["centred", "paper"] = "centred",
+        num_qvalue_nets: int = 2,
+        num_actor_states: int | None = None,
+        num_action_samples: int = 8,
+        num_next_action_samples: int = 1,
+        loss_function: str = "l2",
+        delay_actor: bool = False,
+        delay_qvalue: bool | None = None,
+        delay_value: bool = True,
+        separate_losses: bool = False,
+        reduction: Literal["none", "mean", "sum"] | None = None,
+        skip_done_states: bool = False,
+        use_prioritized_weights: bool | Literal["auto"] = "auto",
+        deactivate_vmap: bool = False,
+    ) -> None:
+        if projection not in PROJECTIONS:
+            raise ValueError(f"projection must be one of {PROJECTIONS}, got {projection!r}.")
+        super().__init__(
+            actor_network,
+            qvalue_network,
+            value_network,
+            tau=tau,
+            tau_prime=tau_prime,
+            target_kl=target_kl,
+            target_entropy=target_entropy,
+            min_tau=min_tau,
+            min_tau_prime=min_tau_prime,
+            num_qvalue_nets=num_qvalue_nets,
+            num_actor_states=num_actor_states,
+            num_action_samples=num_action_samples,
+            num_next_action_samples=num_next_action_samples,
+            loss_function=loss_function,
+            delay_actor=delay_actor,
+            delay_qvalue=delay_qvalue,
+            delay_value=delay_value,
+            separate_losses=separate_losses,
+            reduction=reduction,
+            skip_done_states=skip_done_states,
+            use_prioritized_weights=use_prioritized_weights,
+            deactivate_vmap=deactivate_vmap,
+        )
+        self.projection = projection
+
+    def project(
+        self, tensordict: TensorDictBase, policy: Distribution, reference: Distribution
+    ) -> tuple[Tensor, Lift]:
+        """Eq. 11 with self-normalised weights, in nats; centred or to the letter."""
+        lift = self.lift(tensordict, reference, self.qvalue_network_params, self.num_action_samples)
+        actions = lift.sampled_actions
+        if self.projection == "centred":
+            loc, scale = gaussian_parameters(policy)
+            projection = centred_gaussian_projection(
+                loc, scale, actions.latent, lift.log_weights, sample_dim=0
+            )
+        else:
+            log_prob = log_prob_of(actions, policy)
+            projection = mean_seeking_projection(log_prob, lift.log_weights, sample_dim=0)
+        return projection.loss, lift
+
+
+class DiscreteECACLoss(DiscreteActorCriticLoss):
+    r"""ECAC for discrete actions: Eq. 8 and 11 summed over all actions, nothing sampled.
+
+    .. math::
+        L(\theta) = -\sum_a \bar\pi^*(a|s) \log \pi_\theta(a|s), \quad
+        \bar\pi^*(a|s) = \mathrm{softmax}_a \frac{Q(s, a) + \tau \log \bar\pi(a|s)}{\tau + \tau'}
+
+    Args:
+        actor_network: a policy with ``get_dist`` over ``n`` actions: ``Categorical`` or
+            ``OneHotCategorical``.
+        qvalue_network: reads the observation, writes ``"action_value"`` ``[*B, n]``.
+        value_network: as for :class:`ECACLoss`.
+
+    Keyword Args:
+        tau: as for :class:`ECACLoss`. Default: 0.3.
+        tau_prime: as for :class:`ECACLoss`. Default: 0.1.
+        target_kl: KL(target, pi_bar) in nats that tau is learned to hold. Default: 0.1.
+        target_entropy: entropy in nats that tau_prime is learned to hold; ``"auto"`` is
+            0.98 log n, that of TorchRL's ``DiscreteSACLoss``. None (default): tau_prime is fixed,
+            or scheduled by assignment.
+        min_tau: as for :class:`ECACLoss`.
+        min_tau_prime: as for :class:`ECACLoss`.
+        num_qvalue_nets: as for :class:`ECACLoss`.
+        num_actor_states: as for :class:`ECACLoss`.
+        loss_function: as for :class:`ECACLoss`.
+        delay_actor: as for :class:`ECACLoss`.
+        delay_qvalue: as for :class:`ECACLoss`.
+        delay_value: as for :class:`ECACLoss`.
+        separate_losses: as for :class:`ECACLoss`.
+        reduction: as for :class:`ECACLoss`.
+        skip_done_states: as for :class:`ECACLoss`.
+        use_prioritized_weights: as for :class:`ECACLoss`.
+        deactivate_vmap: as for :class:`ECACLoss`.
+
+    The outputs are those of :class:`ECACLoss` without ``saturation``.
+
+    Raises:
+        ValueError: for continuous actions, and as for :class:`ECACLoss`.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torch.distributions import Categorical
+        >>> from torchrl.modules import ProbabilisticActor
+        >>> net = TensorDictModule(torch.nn.Linear(3, 4), ["observation"], ["logits"])
+        >>> actor = ProbabilisticActor(net, ["logits"], distribution_class=Categorical)
+        >>> qvalue = TensorDictModule(torch.nn.Linear(3, 4), ["observation"], ["action_value"])
+        >>> loss_module = DiscreteECACLoss(actor, qvalue, delay_qvalue=False)
+        >>> batch = TensorDict({
+        ...     "observation": torch.randn(5, 3),
+        ...     "action": torch.randint(4, (5,)),
+        ...     "next": {
+        ...         "observation": torch.randn(5, 3),
+        ...         "reward": torch.rand(5, 1),
+        ...         "done": torch.zeros(5, 1, dtype=torch.bool),
+        ...         "terminated": torch.zeros(5, 1, dtype=torch.bool),
+        ...     },
+        ... }, batch_size=[5])
+        >>> loss_module(batch)["loss_actor"].backward()
+    """
+
+    _twin = "ECACLoss"
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        qvalue_network: TensorDictModule | list[TensorDictModule],
+        value_network: TensorDictModule | None = None,
+        *,
+        tau: float = 0.3,
+        tau_prime: float = 0.1,
+        target_kl: float | None = 0.1,
+        target_entropy: float | Literal["auto"] | None = None,
+        min_tau: float = 0.001,
+        min_tau_prime: float = 0.003,
+        num_qvalue_nets: int = 2,
+        num_actor_states: int | None = None,
+        loss_function: str = "l2",
+        delay_actor: bool = False,
+        delay_qvalue: bool | None = None,
+        delay_value: bool = True,
+        separate_losses: bool = False,
+        reduction: Literal["none", "mean", "sum"] | None = None,
+        skip_done_states: bool = False,
+        use_prioritized_weights: bool | Literal["auto"] = "auto",
+        deactivate_vmap: bool = False,
+    ) -> None:
+        super().__init__(
+            actor_network,
+            qvalue_network,
+            value_network,
+            tau=tau,
+            tau_prime=tau_prime,
+            target_kl=target_kl,
+            target_entropy=target_entropy,
+            min_tau=min_tau,
+            min_tau_prime=min_tau_prime,
+            num_qvalue_nets=num_qvalue_nets,
+            num_actor_states=num_actor_states,
+            loss_function=loss_function,
+            delay_actor=delay_actor,
+            delay_qvalue=delay_qvalue,
+            delay_value=delay_value,
+            separate_losses=separate_losses,
+            reduction=reduction,
+            skip_done_states=skip_done_states,
+            use_prioritized_weights=use_prioritized_weights,
+            deactivate_vmap=deactivate_vmap,
+        )
+
+    def project(
+        self, tensordict: TensorDictBase, policy: Distribution, reference: Distribution
+    ) -> tuple[Tensor, Lift]:
+        """Eq. 11, in nats."""
+        lift = self.lift(tensordict, reference, self.qvalue_network_params, self.num_action_samples)
+        log_prob = log_probs_of_all(policy)
+        return mean_seeking_projection(log_prob, lift.log_weights, sample_dim=0).loss, lift
