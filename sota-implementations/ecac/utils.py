@@ -1,0 +1,334 @@
+"""What ``ecac.py`` is built from: environments, networks, losses, and how they are measured."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import torch
+from omegaconf import DictConfig, OmegaConf
+from PIL import Image
+from score_sac import ScoreSACLoss
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer
+from torchrl.envs import (
+    CatTensors,
+    Compose,
+    DMControlEnv,
+    DoubleToFloat,
+    EnvBase,
+    ExplorationType,
+    GymEnv,
+    RewardSum,
+    StepCounter,
+    TransformedEnv,
+    set_exploration_type,
+)
+from torchrl.modules import AdditiveGaussianModule
+from torchrl.objectives import DDPGLoss, LossModule, SACLoss, TargetNetUpdater, TD3Loss
+
+from torchrl_ecpo import (
+    ECACLoss,
+    PeriodicCopy,
+    PMDACLoss,
+    PolyakAverage,
+    TemperatureScheduler,
+    UpdaterSequence,
+)
+from torchrl_ecpo.modules import (
+    make_deterministic_actor,
+    make_qvalue_network,
+    make_tanh_gaussian_actor,
+    make_value_network,
+)
+from torchrl_ecpo.schedules import make_schedule
+
+LOSSES = {
+    "ecac": ECACLoss,
+    "pmd_ac": PMDACLoss,
+    "sac": SACLoss,
+    "sac_score": ScoreSACLoss,
+    "td3": TD3Loss,
+    "ddpg": DDPGLoss,
+}
+ACTORS = {"tanh_gaussian": make_tanh_gaussian_actor, "deterministic": make_deterministic_actor}
+TEMPERATURES = ("tau", "tau_prime")
+SHOWN = ("evaluation_return", "return", "entropy", "alpha", "tau", "tau_prime", "steps_per_second")
+LONGEST_EPISODE = 100_000
+
+
+def check_config(config: DictConfig) -> None:
+    """Refuse settings with which a run would never end, or break late."""
+    counts = {
+        "total_frames": config.total_frames,
+        "log_interval": config.log_interval,
+        "evaluation.interval": config.evaluation.interval,
+        "evaluation.episodes": config.evaluation.episodes,
+        "collector.frames_per_batch": config.collector.frames_per_batch,
+        "updates_per_frame": config.updates_per_frame,
+        "threads": config.threads,
+    }
+    for name, value in counts.items():
+        if not isinstance(value, int) or value < 1:
+            raise ValueError(f"{name} must be an integer of at least 1, got {value!r}.")
+    if config.evaluation.interval % config.log_interval:
+        raise ValueError(
+            "evaluation.interval must be a multiple of log_interval, got "
+            f"{config.evaluation.interval} and {config.log_interval}."
+        )
+    if not isinstance(config.seed, int):
+        raise ValueError(f"seed must be an integer, got {config.seed!r}.")
+    if config.replay_buffer.storage not in ("tensor", "memmap"):
+        raise ValueError(
+            "replay_buffer.storage must be 'tensor' or 'memmap', got "
+            f"{config.replay_buffer.storage!r}."
+        )
+
+
+# ------------------------------------------------------------------------------------ environments
+
+
+def make_environment(config: DictConfig, *, seed: int, is_evaluation: bool = False) -> EnvBase:
+    """The task that ``env=`` names, with one vector as observation, in single precision."""
+    with_pixels = is_evaluation and config.evaluation.video
+    make = {"gym": _make_gym, "dm_control": _make_dm_control}[config.env.kind]
+    env = make(config.env, from_pixels=with_pixels, pixels_only=False)
+    transforms: list[Any] = [DoubleToFloat(), RewardSum(), StepCounter()]
+    if config.env.kind == "dm_control":
+        parts = [key for key in list(env.observation_spec.keys()) if key != "pixels"]
+        transforms.insert(0, CatTensors(in_keys=sorted(parts), out_key="observation"))
+    env = TransformedEnv(env, Compose(*transforms))
+    env.set_seed(seed)
+    return env
+
+
+def _make_gym(config: DictConfig, **options: Any) -> EnvBase:
+    try:
+        return GymEnv(config.name, **options)
+    except gym.error.DependencyNotInstalled as error:
+        raise _missing(config.name, error) from error
+    except gym.error.Error as error:
+        raise ValueError(f"env.name={config.name} is no task of gymnasium: {error}") from error
+
+
+def _make_dm_control(config: DictConfig, **options: Any) -> EnvBase:
+    # dm_control looks for a display as soon as it is imported.
+    os.environ.setdefault("MUJOCO_GL", "egl" if options["from_pixels"] else "disabled")
+    task = f"env.name={config.name} env.task={config.task}"
+    try:
+        return DMControlEnv(config.name, config.task, **options)
+    except ImportError as error:
+        raise _missing(task, error) from error
+    except RuntimeError as error:
+        raise ValueError(f"{task} cannot be made by dm_control: {error}") from error
+
+
+def _missing(task: str, error: Exception) -> ModuleNotFoundError:
+    return ModuleNotFoundError(
+        f"{task} needs what is not installed: {error} For MuJoCo and dm_control: "
+        "pip install 'torchrl-ecpo[mujoco]'."
+    )
+
+
+# ------------------------------------------------------------------------------ networks and losses
+
+
+def make_actor(config: DictConfig, env: EnvBase) -> TensorDictModuleBase:
+    """The policy without exploration."""
+    return ACTORS[config.loss.actor](
+        _observation_size(env), env.action_spec_unbatched, hidden_sizes=config.hidden_sizes
+    )
+
+
+def make_loss(config: DictConfig, actor: TensorDictModuleBase, env: EnvBase) -> LossModule:
+    """The loss that ``loss=`` names, with its critics."""
+    action_spec: Any = env.action_spec_unbatched
+    sizes = {"hidden_sizes": config.hidden_sizes}
+    critics = [make_qvalue_network(_observation_size(env), action_spec.shape[-1], **sizes)]
+    if config.loss.value_network:
+        critics.append(make_value_network(_observation_size(env), **sizes))
+    options = {str(name): value for name, value in config.loss.options.items()}
+    for name in TEMPERATURES:
+        if isinstance(options.get(name), DictConfig):
+            options[name] = make_schedule(_plain(options[name]))(0)
+    if "reference_interval" in config.loss:
+        options["delay_actor"] = config.loss.reference_interval > 1
+    if config.loss.name == "td3":
+        options["action_spec"] = action_spec
+        options["policy_noise"] *= _half_range(action_spec)
+        options["noise_clip"] *= _half_range(action_spec)
+    loss_module = LOSSES[config.loss.name](actor, *critics, **options)
+    loss_module.make_value_estimator(gamma=config.gamma)
+    return loss_module
+
+
+def make_temperatures(config: DictConfig, loss_module: LossModule) -> TemperatureScheduler:
+    """Schedules of the temperatures that have one, counted in frames."""
+    settings = {name: config.options.get(name) for name in TEMPERATURES}
+    schedules = {
+        name: make_schedule(_plain(setting))
+        for name, setting in settings.items()
+        if isinstance(setting, DictConfig)
+    }
+    return TemperatureScheduler(loss_module, **schedules)
+
+
+def make_updater(config: DictConfig, loss_module: LossModule) -> TargetNetUpdater:
+    """Polyak averages; the reference policy of ECAC and PMD-AC is a copy instead."""
+    delayed = [
+        name.removeprefix("target_").removesuffix("_params")
+        for name, _ in loss_module.named_children()
+        if name.startswith("target_")
+    ]
+    updaters: list[TargetNetUpdater] = []
+    if config.loss.get("reference_interval", 1) > 1:
+        delayed.remove("actor_network")
+        interval = config.loss.reference_interval
+        updaters.append(PeriodicCopy(loss_module, "actor_network", interval=interval))
+    return UpdaterSequence(PolyakAverage(loss_module, *delayed, tau=config.polyak), *updaters)
+
+
+def make_optimizer(learning_rates: DictConfig, loss_module: LossModule) -> torch.optim.Optimizer:
+    """Adam, with a learning rate for each network and each learned temperature."""
+    groups: dict[str, list[Tensor]] = {}
+    for name, parameter in loss_module.named_parameters():
+        owner = name.split(".")[0].removesuffix("_params")
+        groups.setdefault(owner, []).append(parameter)
+    if groups.keys() != set(learning_rates):
+        raise ValueError(
+            f"loss.lr must have a learning rate for each of {sorted(groups)}, got "
+            f"{sorted(map(str, learning_rates))}."
+        )
+    return torch.optim.Adam(
+        [{"params": groups[name], "lr": learning_rates[name]} for name in groups], fused=True
+    )
+
+
+def make_policy(config: DictConfig, actor: Any, env: EnvBase) -> TensorDictModuleBase:
+    """The policy that collects: the actor, with Gaussian noise where it is deterministic."""
+    if config.exploration is None:
+        return actor
+    noise: Any = AdditiveGaussianModule(
+        env.action_spec_unbatched,
+        sigma_init=1.0,
+        sigma_end=1.0,
+        std=config.exploration * _half_range(env.action_spec_unbatched),
+    )
+    return TensorDictSequential(actor, noise)
+
+
+def _observation_size(env: EnvBase) -> int:
+    return env.observation_spec["observation"].shape[-1]
+
+
+def _half_range(action_spec: Any) -> float:
+    return float((action_spec.space.high - action_spec.space.low).max() / 2)
+
+
+def _plain(setting: DictConfig) -> Any:
+    return OmegaConf.to_container(setting, resolve=True)
+
+
+# --------------------------------------------------------------------------------------------- data
+
+
+def make_collector(config: DictConfig, policy: TensorDictModuleBase) -> Collector:
+    """One collector in this process, or several in processes of their own."""
+    options: dict[str, Any] = {
+        "frames_per_batch": config.collector.frames_per_batch,
+        "total_frames": config.total_frames,
+        "init_random_frames": config.collector.init_random_frames,
+        "auto_register_policy_transforms": False,
+    }
+    if config.collector.kind == "single":
+        return Collector(make_environment(config, seed=config.seed), policy, **options)
+    seeds = range(config.seed, config.seed + config.collector.num_collectors)
+    makers = [partial(_make_worker_environment, config, seed) for seed in seeds]
+    is_sync = config.collector.kind == "multi_sync"
+    return Collector(makers, policy, num_collectors=len(makers), sync=is_sync, **options)
+
+
+def _make_worker_environment(config: DictConfig, seed: int) -> EnvBase:
+    torch.manual_seed(seed)  # a worker has a generator of its own, which draws its actions
+    return make_environment(config, seed=seed)
+
+
+def make_replay_buffer(config: DictConfig) -> ReplayBuffer:
+    """Uniform samples of all transitions, from a generator of its own."""
+    size = config.replay_buffer.size
+    in_memory = config.replay_buffer.storage == "tensor"
+    return ReplayBuffer(
+        storage=(
+            LazyTensorStorage(size)
+            if in_memory
+            else LazyMemmapStorage(size, scratch_dir="replay_buffer")
+        ),
+        batch_size=config.replay_buffer.batch_size,
+        generator=torch.Generator().manual_seed(config.seed),
+    )
+
+
+# ------------------------------------------------------------------------------------- measurements
+
+
+def finished_returns(transitions: TensorDictBase) -> list[float]:
+    """Returns of the episodes that end in a batch."""
+    return transitions["next", "episode_reward"][transitions["next", "done"]].tolist()
+
+
+@torch.no_grad()
+def evaluate(
+    env: EnvBase, actor: TensorDictModuleBase, config: DictConfig, frames: int
+) -> dict[str, float]:
+    """Mean return of whole episodes with the deterministic policy; a video of the first."""
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        episodes = [env.rollout(LONGEST_EPISODE, actor) for _ in range(config.episodes)]
+    if config.video:
+        first, *others = (Image.fromarray(pixels.numpy()) for pixels in episodes[0]["pixels"])
+        first.save(f"evaluation_{frames}.gif", save_all=True, append_images=others)
+    returns = [episode["next", "episode_reward"][-1].item() for episode in episodes]
+    return {"evaluation_return": mean(returns)}
+
+
+def scalars(losses: TensorDictBase) -> dict[str, float]:
+    """The entries of a loss's output that are one number."""
+    return {str(name): value.item() for name, value in losses.items() if value.numel() == 1}
+
+
+def mean(values: Sequence[float]) -> float:
+    """The mean; NaN of nothing."""
+    return sum(values) / len(values) if values else float("nan")
+
+
+class Every:
+    """Whether a growing count has passed another multiple of an interval since last asked."""
+
+    def __init__(self, interval: int) -> None:
+        self.interval = interval
+        self.passed = 0
+
+    def __call__(self, count: int) -> bool:
+        """Ask at a count."""
+        passed, self.passed = self.passed, count // self.interval
+        return self.passed > passed
+
+
+class Speed:
+    """Growth of a count per second since last asked."""
+
+    def __init__(self) -> None:
+        self.count, self.time = 0, time.perf_counter()
+
+    def __call__(self, count: int) -> float:
+        """Ask at a count."""
+        now = time.perf_counter()
+        rate = (count - self.count) / (now - self.time)
+        self.count, self.time = count, now
+        return rate

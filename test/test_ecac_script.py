@@ -1,0 +1,250 @@
+"""The actor-critic script, started as a user would start it, and what it is built from."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from tensordict import TensorDict
+
+from torchrl_ecpo.experiment import read_metrics
+
+SCRIPT = Path(__file__).parents[1] / "sota-implementations/ecac"
+TINY = (
+    "total_frames=240",
+    "log_interval=80",
+    "evaluation.interval=160",
+    "evaluation.episodes=1",
+    "collector.init_random_frames=80",
+    "hidden_sizes=[16,16]",
+    "replay_buffer.batch_size=32",
+    "loss.options.num_actor_states=16",
+)
+LOSSES = ("ecac", "pmd_ac", "sac", "sac_score", "td3", "ddpg")
+
+
+def start(directory, *overrides):
+    flags = [override for override in overrides if override.startswith("--")]
+    options = [override for override in overrides if override not in flags]
+    command = [sys.executable, str(SCRIPT / "ecac.py"), *flags, *options]
+    return subprocess.run(command, capture_output=True, text=True, cwd=directory, check=False)
+
+
+def tiny(overrides):
+    """The settings of a short run; the number of actor states is ECAC's own."""
+    is_ecac = not any(override.startswith("loss=") for override in overrides)
+    return TINY if is_ecac else TINY[:-1]
+
+
+def run_ecac(directory, *overrides):
+    process = start(directory, *tiny(overrides), f"hydra.run.dir={directory}", *overrides)
+    assert process.returncode == 0, process.stderr
+    return read_metrics(directory)
+
+
+def reproducible(metrics):
+    """All but speed; as text, in which NaN equals NaN."""
+    return {name: str(column) for name, column in metrics.items() if name != "steps_per_second"}
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory):
+    """Every loss, by one start of the script."""
+    directory = tmp_path_factory.mktemp("sweep")
+    process = start(
+        directory,
+        "--multirun",
+        f"loss={','.join(LOSSES)}",
+        "seed=3",
+        *TINY[:-1],
+        f"hydra.sweep.dir={directory}",
+        "hydra.sweep.subdir=${loss.name}",
+    )
+    assert process.returncode == 0, process.stderr
+    return directory
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_every_loss_trains_on_pendulum(sweep, loss):
+    metrics = read_metrics(sweep / loss)
+    assert metrics["step"] == [80, 160, 240]
+    losses = [name for name in metrics if name.startswith("loss_")]
+    assert len(losses) >= 2
+    for name in losses:
+        assert math.isnan(metrics[name][0]), "no updates while actions are random"
+        assert all(map(math.isfinite, metrics[name][1:]))
+    assert list(map(math.isnan, metrics["evaluation_return"])) == [True, False, True]
+    assert -2000 < metrics["evaluation_return"][1] < 0
+    # The only episode that ended, after 200 steps; the time limit is none that bootstrapping sees.
+    assert list(map(math.isnan, metrics["return"])) == [True, True, False]
+    assert json.loads((sweep / loss / "summary.json").read_text())["finished"] is True
+    assert OmegaConf.load(sweep / loss / "config.yaml").loss.name == loss
+    assert (sweep / loss / "curve.png").exists()
+
+
+def test_the_same_seed_gives_the_same_run_and_another_another(sweep, tmp_path):
+    options = ("--multirun", "loss=sac", "seed=3,4", *TINY[:-1])
+    where = (f"hydra.sweep.dir={tmp_path}", "hydra.sweep.subdir=${seed}")
+    process = start(tmp_path, *options, *where)
+    assert process.returncode == 0, process.stderr
+    again, other = read_metrics(tmp_path / "3"), read_metrics(tmp_path / "4")
+    assert reproducible(again) == reproducible(read_metrics(sweep / "sac"))
+    assert other["evaluation_return"][1] != again["evaluation_return"][1]
+    assert other["return"][2] != again["return"][2]
+
+
+def test_evaluation_does_not_disturb_training(sweep, tmp_path):
+    often = run_ecac(tmp_path, "loss=td3", "seed=3", "evaluation.interval=80")
+    seldom = read_metrics(sweep / "td3")
+    for name in ("return", "loss_actor", "loss_qvalue"):
+        assert str(often[name]) == str(seldom[name])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("env=hopper", "replay_buffer.storage=memmap"),
+        ("env=dm_control", "loss=td3"),
+        ("env=dm_control", "env.name=pendulum", "env.task=swingup", "loss=sac"),
+        ("collector=multi_sync", "loss=sac"),
+        ("loss.reference_interval=5", "loss.options.projection=paper"),
+        ("loss.value_network=true", "+loss.lr.value_network=3e-4"),
+        (
+            "loss.options.target_kl=null",
+            "~loss.lr.log_tau",
+            "loss.options.tau={schedule:linear,start:0.2,end:0.1,duration:160}",
+        ),
+    ],
+    ids=lambda options: " ".join(options),
+)
+def test_tasks_collectors_and_ablations_run(tmp_path, options):
+    if "env=hopper" in options or "env=dm_control" in options:
+        pytest.importorskip("mujoco")
+    metrics = run_ecac(tmp_path, *options)
+    assert metrics["step"][-1] == 240
+    assert math.isfinite(metrics["loss_actor"][-1])
+    if any("schedule" in option for option in options):
+        # Counted from the first update on: 160 frames are left after the random ones.
+        assert metrics["tau"][1:] == pytest.approx([0.15, 0.1], abs=0.01)
+
+
+@pytest.fixture
+def utils(monkeypatch):
+    monkeypatch.syspath_prepend(str(SCRIPT))
+    import utils
+
+    yield utils
+    sys.modules.pop("utils")
+
+
+def test_an_unknown_task_is_refused_before_anything_starts(tmp_path):
+    process = start(tmp_path, "env=chess")
+    assert process.returncode != 0
+    assert "Could not find 'env/chess'" in process.stderr
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["env=gym", "env.name=Chess-v0"], "env.name=Chess-v0 is no task of gymnasium"),
+        (["env=gym", "env.name=CartPole-v1"], "must be of bounded continuous actions"),
+        (["env=dm_control", "env.task=fly"], "env.name=cheetah env.task=fly cannot be made"),
+        (["collector.frames_per_batch=0"], "frames_per_batch must be an integer of at least 1"),
+        (["log_interval=70"], "evaluation.interval must be a multiple of log_interval"),
+        (["replay_buffer.storage=tape"], "storage must be 'tensor' or 'memmap', got 'tape'"),
+        (["~loss.lr.log_tau"], "loss.lr must have a learning rate for each of"),
+        (["loss.options.num_action_samples=0"], "num_action_samples must be"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_bad_options_end_with_a_clear_message(utils, overrides, message):
+    with initialize_config_dir(str(SCRIPT / "config"), version_base="1.3"):
+        config = compose("config", [*TINY, *overrides])
+    with pytest.raises(ValueError, match=message):  # noqa: PT012 - the script's first steps
+        utils.check_config(config)
+        env = utils.make_environment(config, seed=0)
+        loss_module = utils.make_loss(config, utils.make_actor(config, env), env)
+        utils.make_optimizer(config.loss.lr, loss_module)
+
+
+def test_a_missing_simulator_is_named_with_its_extra(utils, monkeypatch):
+    def fail(name, **options):
+        raise gym.error.DependencyNotInstalled("No mujoco.")
+
+    monkeypatch.setattr(utils, "GymEnv", fail)
+    config = OmegaConf.create(
+        {"env": {"kind": "gym", "name": "Ant-v5"}, "evaluation": {"video": 0}}
+    )
+    with pytest.raises(
+        ModuleNotFoundError, match=r"Ant-v5 .* pip install 'torchrl-ecpo\[mujoco\]'"
+    ):
+        utils.make_environment(config, seed=0)
+
+
+def test_a_video_of_the_first_episode_is_saved(utils, tmp_path, monkeypatch):
+    """Without a renderer: an environment is asked for rollouts with pixels only."""
+
+    class Env:
+        def rollout(self, max_steps, policy):
+            pixels = torch.randint(256, (4, 8, 6, 3), dtype=torch.uint8)
+            rewards = torch.arange(4.0).unsqueeze(-1)
+            return TensorDict({"pixels": pixels, "next": {"episode_reward": rewards}}, [4])
+
+    monkeypatch.chdir(tmp_path)
+    config = OmegaConf.create({"episodes": 2, "video": True})
+    assert utils.evaluate(Env(), None, config, 40) == {"evaluation_return": 3.0}
+    with utils.Image.open("evaluation_40.gif") as video:
+        assert (video.n_frames, video.size) == (4, (6, 8))
+
+
+@pytest.mark.parametrize(("name", "ends_early"), [("Pendulum-v1", False), ("Hopper-v5", True)])
+def test_time_limits_are_truncations(utils, name, ends_early):
+    if name == "Hopper-v5":
+        pytest.importorskip("mujoco")
+    env = {"kind": "gym", "name": name}
+    config = OmegaConf.create({"env": env, "evaluation": {"video": False}})
+    last = utils.make_environment(config, seed=0).rollout(1000)[-1]["next"]
+    assert last["done"].item()
+    assert last["terminated"].item() is ends_early
+    assert last["truncated"].item() is not ends_early
+    assert last["observation"].dtype == torch.float32
+
+
+def test_every_asks_once_an_interval(utils):
+    every = utils.Every(10)
+    assert [count for count in range(4, 60, 4) if every(count)] == [12, 20, 32, 40, 52]
+
+
+def test_the_score_function_gradient_is_the_reparameterised_one_in_expectation(utils):
+    torch.manual_seed(0)
+    spec = utils.GymEnv("Pendulum-v1").action_spec
+    networks = (
+        utils.make_tanh_gaussian_actor(3, spec, hidden_sizes=[4]),
+        utils.make_qvalue_network(3, 1, hidden_sizes=[4]),
+        utils.make_value_network(3, hidden_sizes=[4]),
+    )
+    batch = TensorDict({"observation": torch.randn(1, 3).expand(200_000, 3)}, [200_000])
+    options = {"num_qvalue_nets": 1, "loss_function": "l2"}
+    parameters = list(networks[0].parameters())
+    losses = [make(*networks, **options) for make in (utils.SACLoss, utils.ScoreSACLoss)]
+    losses[1].qvalue_network_params.data.copy_(losses[0].qvalue_network_params.data)
+    gradients = [
+        torch.autograd.grad(loss_module.actor_loss(batch)[0], parameters) for loss_module in losses
+    ]
+    torch.testing.assert_close(*gradients, rtol=0.02, atol=0.01)
+
+
+@pytest.mark.slow  # some three minutes
+def test_ecac_swings_the_pendulum_up(tmp_path):
+    process = start(tmp_path, "env=pendulum", "seed=0", f"hydra.run.dir={tmp_path}")
+    assert process.returncode == 0, process.stderr
+    returns = [value for value in read_metrics(tmp_path)["evaluation_return"] if value == value]
+    assert returns[-1] > -300, returns
