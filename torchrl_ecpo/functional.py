@@ -215,9 +215,8 @@ def lift_divergence_estimate(
         >>> lift_divergence_estimate(torch.tensor([[0.5, 0.5], [1.0, 0.0]])) / math.log(2)
         tensor([0., 1.])
     """
-    uniform = _uniform_weights(weights, sample_dim, mask)
-    # 0 log 0 = 0, and a masked sample has weight 0 in both.
-    log_ratio = (weights.clamp_min(_tiny(weights)) / uniform.clamp_min(_tiny(weights))).log()
+    # 0 log 0 = 0
+    log_ratio = weights.clamp_min(_tiny(weights)).log() - _log_uniform(weights, sample_dim, mask)
     return _weighted_sum(weights, log_ratio, sample_dim, mask).clamp_min(0.0)
 
 
@@ -598,8 +597,7 @@ def soft_value_estimate(
         tensor(1.5000)
     """
     log_weights = lifted_log_weights(score, reference_log_prob, tau=tau, tau_prime=tau_prime)
-    uniform = _uniform_weights(log_weights, sample_dim, mask)
-    log_uniform = uniform.clamp_min(_tiny(uniform)).log()
+    log_uniform = _log_uniform(log_weights, sample_dim, mask)
     return (tau + tau_prime) * _masked_logsumexp(log_weights + log_uniform, sample_dim, mask)
 
 
@@ -747,6 +745,13 @@ def _uniform_weights(like: Tensor, dim: int, mask: Tensor | None) -> Tensor:
     if mask is None:
         return torch.full_like(like, 1 / like.shape[dim])
     return self_normalised_weights(torch.zeros_like(like), sample_dim=dim, mask=mask)
+
+
+def _log_uniform(like: Tensor, dim: int, mask: Tensor | None) -> Tensor | float:
+    """Logarithm of :func:`_uniform_weights`; that of 0 is very low."""
+    if mask is None:
+        return -math.log(like.shape[dim])
+    return _uniform_weights(like, dim, mask).clamp_min(_tiny(like)).log()
 
 
 def _masked_logsumexp(values: Tensor, dim: int, mask: Tensor | None) -> Tensor:
