@@ -8,10 +8,10 @@ export OMP_NUM_THREADS ?= 1
 export MUJOCO_GL ?= disabled
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow lint format types clean
+.PHONY: help install demo test test-slow test-faults lint format types clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 # The stamp is newer than what it was made from, so a second call starts at once.
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -37,6 +37,9 @@ test: install ## run every test that takes less than some ten seconds
 
 test-slow: install ## run the tests that take longer
 	$(RUN) -m pytest -n auto -q -m slow
+
+test-faults: install ## kill runs at random moments, fill a disk, and resume
+	$(RUN) -m pytest -q -m slow test/test_faults.py
 
 lint: install ## check style and formatting
 	$(RUN) -m ruff check .

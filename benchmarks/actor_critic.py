@@ -28,7 +28,7 @@ from tensordict import TensorDict, TensorDictBase
 SCRIPT = Path(__file__).resolve().parents[1] / "sota-implementations/ecac"
 sys.path.append(str(SCRIPT))
 
-from ecac import step  # noqa: E402 # pyright: ignore[reportMissingImports]
+from ecac import total  # noqa: E402 # pyright: ignore[reportMissingImports]
 from utils import (  # noqa: E402 # pyright: ignore[reportMissingImports]
     make_actor,
     make_collector,
@@ -46,6 +46,9 @@ UPDATES = {
     "ecac, M = 16": ["loss=ecac", "loss.options.num_action_samples=16"],
 }
 LOOPS = {"sac": ["loss=sac"], "ecac": ["loss=ecac"]}
+
+
+FRAMES = 200  # of a loop, in its turn
 
 
 def configure(overrides: list[str]) -> DictConfig:
@@ -74,6 +77,13 @@ def random_batch(env_batch: TensorDictBase, size: int) -> TensorDict:
     )
 
 
+def step(optimizer: torch.optim.Optimizer, losses: TensorDictBase) -> None:
+    """The script's gradient step."""
+    total(losses, is_policy_due=True).backward()
+    optimizer.step()
+    optimizer.zero_grad()
+
+
 def update(config: DictConfig) -> Iteration:
     """Updates on one random batch."""
     env = make_environment(config, seed=0)
@@ -84,7 +94,7 @@ def update(config: DictConfig) -> Iteration:
 
     def iterate() -> int:
         for _ in range(10):
-            step(optimizer, loss_module(batch), is_policy_due=True)
+            step(optimizer, loss_module(batch))
             updater.step()
         return 10
 
@@ -92,7 +102,7 @@ def update(config: DictConfig) -> Iteration:
 
 
 def script_loop(config: DictConfig) -> Iteration:
-    """A batch of the collector, and an update for each of its frames."""
+    """Batches of the collector, and an update for each of their frames."""
     env = make_environment(config, seed=0)
     actor = make_actor(config, env)
     loss_module = make_loss(config, actor, env)
@@ -102,17 +112,20 @@ def script_loop(config: DictConfig) -> Iteration:
     batches = iter(make_collector(config, make_policy(config.loss, actor, env)))
 
     def iterate() -> int:
-        transitions = next(batches)
-        replay_buffer.extend(transitions.select(*loss_module.in_keys, strict=False))
-        for _ in range(len(transitions)):
-            step(optimizer, loss_module(replay_buffer.sample()), is_policy_due=True)
-            updater.step()
-        return len(transitions)
+        frames = 0
+        while frames < FRAMES:
+            transitions = next(batches)
+            frames += len(transitions)
+            replay_buffer.extend(transitions.select(*loss_module.in_keys, strict=False))
+            for _ in range(len(transitions)):
+                step(optimizer, loss_module(replay_buffer.sample()))
+                updater.step()
+        return frames
 
     return iterate
 
 
-def peer_loop(frames: int) -> Iteration:
+def peer_loop() -> Iteration:
     """As many frames of Stable-Baselines3's SAC."""
     from stable_baselines3 import SAC
 
@@ -120,8 +133,8 @@ def peer_loop(frames: int) -> Iteration:
     model.learn(1)
 
     def iterate() -> int:
-        model.learn(frames, reset_num_timesteps=False)
-        return frames
+        model.learn(FRAMES, reset_num_timesteps=False)
+        return FRAMES
 
     return iterate
 
@@ -138,15 +151,14 @@ def compare(kind: str, iterations: dict[str, Iteration], repeats: int) -> list[d
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--repeats", type=int, default=40)
+    parser.add_argument("--repeats", type=int, default=10)
     add_csv_option(parser)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     updates = {name: update(configure(overrides)) for name, overrides in UPDATES.items()}
     rows = compare("update", updates, arguments.repeats)
-    frames = configure([]).collector.frames_per_batch
     loops = {name: script_loop(configure(overrides)) for name, overrides in LOOPS.items()}
-    loops = {"Stable-Baselines3 SAC": peer_loop(frames), **loops}
+    loops = {"Stable-Baselines3 SAC": peer_loop(), **loops}
     rows += compare("loop", loops, arguments.repeats)
     print("what    method                   ms a step  time ratio  speed ratio")
     for row in rows:

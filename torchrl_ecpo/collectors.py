@@ -6,6 +6,7 @@ trajectories together; the environment has the batch size `[*B, K]` with `prod(B
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence, Set
 from copy import deepcopy
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor, nn
 from torchrl.collectors import Collector, MultiAsyncCollector, MultiCollector, MultiSyncCollector
 from torchrl.collectors.utils import _maybe_normalize_replay_buffer_tensordict_device
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import RandomPolicy
 
@@ -252,6 +253,18 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
         super().update_policy_weights_(*args, **kwargs)
         self._weight_updates += 1
 
+    def state_dict(self) -> OrderedDict[str, Any]:
+        """The reference policy, the environment and the counters, between two batches."""
+        state = super().state_dict()
+        state["env_state_dict"] = self.env.state_dict()
+        state["base_env_state_dict"] = _base_env(self.env).state_dict()
+        return state
+
+    def load_state_dict(self, state_dict: OrderedDict[str, Any], **kwargs: Any) -> None:
+        """Go on from what :meth:`state_dict` returned."""
+        _base_env(self.env).load_state_dict(state_dict["base_env_state_dict"], **kwargs)
+        super().load_state_dict(state_dict, **kwargs)
+
     def iterator(self) -> Iterator[TensorDictBase | None]:
         """Yield batches, or None after each that is written to the replay buffer."""
         while self._frames < self.total_frames:
@@ -407,6 +420,13 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
     def restarted_trajectories(self) -> int:
         """Trajectories begun and thrown away because the weights changed within a batch."""
         return int(self._restarted)
+
+
+def _base_env(env: EnvBase) -> EnvBase:
+    """The environment without its transforms, whose state dict leaves it out."""
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env
 
 
 def _recorded_keys(

@@ -9,8 +9,11 @@ import hydra
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from utils import (
     SHOWN,
+    BufferState,
+    CollectorState,
     Every,
     Speed,
     check_config,
@@ -27,26 +30,26 @@ from utils import (
     make_updater,
     mean,
     scalars,
+    shut_down,
 )
 
-from torchrl_ecpo.experiment import Run
+from torchrl_ecpo.experiment import Checkpoints, Progress, Run
 
 
-def step(optimizer: torch.optim.Optimizer, losses: TensorDictBase, is_policy_due: bool) -> None:
-    """One gradient step on the sum of the losses, each of which reaches its own parameters only."""
+def total(losses: TensorDictBase, is_policy_due: bool) -> Tensor:
+    """The sum of the losses, each of which reaches its own parameters only."""
     trained = [
         loss
         for name, loss in losses.items()
         if name.startswith("loss_") and (is_policy_due or name != "loss_actor")
     ]
-    torch.stack(trained).sum().backward()
-    optimizer.step()
-    optimizer.zero_grad()
+    return torch.stack(trained).sum()
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
 def main(config: DictConfig) -> None:
     check_config(config)
+    checkpoints = Checkpoints(config)
     torch.set_num_threads(config.threads)
 
     evaluation_env = make_environment(config, seed=config.seed + 1_000_000, is_evaluation=True)
@@ -59,43 +62,69 @@ def main(config: DictConfig) -> None:
     replay_buffer = make_replay_buffer(config)
     collector = make_collector(config, make_policy(config.loss, actor, evaluation_env))
 
-    frames = updates = 0
+    progress = Progress(frames=0, updates=0, returns=[])
     losses = TensorDict()
-    returns: list[float] = []
     is_log_due, is_evaluation_due = Every(config.log_interval), Every(config.evaluation.interval)
-    speed = Speed()
-    with Run(
+    run = Run(
         config,
         total=config.total_frames,
         unit="frames",
         name=f"{config.env.title}/{config.loss.name}/seed_{config.seed}",
         shown=SHOWN,
-    ) as run:
-        for batch in collector:
-            transitions = batch.reshape(-1)
-            frames += len(transitions)
-            returns += finished_returns(transitions)
+    )
+    with (
+        shut_down(collector),
+        run,
+        checkpoints.attach(
+            run,
+            progress,
+            loss_module=loss_module,
+            optimizer=optimizer,
+            updater=updater,
+            temperatures=temperatures,
+            replay_buffer=BufferState(replay_buffer),
+            collector=CollectorState(collector),
+            evaluation_env=evaluation_env,
+            is_log_due=is_log_due,
+            is_evaluation_due=is_evaluation_due,
+        ),
+    ):
+        speed = Speed(progress.frames)
+        collector.update_policy_weights_()
+        batches = iter(collector)
+        while progress.frames < config.total_frames:
+            transitions = next(batches).reshape(-1)
+            progress.frames += len(transitions)
+            progress.returns += finished_returns(transitions)
             replay_buffer.extend(transitions.select(*loss_module.in_keys, strict=False))
 
-            if frames > config.collector.init_random_frames:
+            if progress.frames > config.collector.init_random_frames:
                 for _ in range(len(transitions) * config.updates_per_frame):
-                    updates += 1
-                    is_policy_due = updates % config.loss.policy_delay == 0
+                    is_policy_due = (progress.updates + 1) % config.loss.policy_delay == 0
                     losses = loss_module(replay_buffer.sample())
-                    step(optimizer, losses, is_policy_due)
+                    loss = total(losses, is_policy_due)
+                    if not loss.isfinite():
+                        run.check(scalars(losses), progress.frames)
+                    loss.backward()
+                    optimizer.step()
+                    optimizer.zero_grad()
+                    progress.updates += 1
                     if is_policy_due:
                         updater.step()
                 temperatures.step(len(transitions))
                 collector.update_policy_weights_()
 
-            if is_log_due(frames):
-                metrics = {"return": mean(returns), "steps_per_second": speed(frames)}
-                returns.clear()
-                if is_evaluation_due(frames):
-                    metrics |= evaluate(evaluation_env, actor, config.evaluation, frames)
-                    speed(frames)  # evaluation does not count
-                run.log({**scalars(losses), **metrics}, step=frames)
-    collector.shutdown()
+            if is_log_due(progress.frames):
+                metrics = {
+                    "return": mean(progress.returns),
+                    "steps_per_second": speed(progress.frames),
+                }
+                progress.returns.clear()
+                if is_evaluation_due(progress.frames):
+                    metrics |= evaluate(evaluation_env, actor, config.evaluation, progress.frames)
+                    speed(progress.frames)  # evaluation does not count
+                run.log({**scalars(losses), **metrics}, step=progress.frames)
+            checkpoints.boundary()
 
 
 if __name__ == "__main__":

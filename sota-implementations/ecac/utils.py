@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -13,7 +14,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 from score_sac import ScoreSACLoss
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.collectors import Collector
@@ -42,6 +43,7 @@ from torchrl_ecpo import (
     TemperatureScheduler,
     UpdaterSequence,
 )
+from torchrl_ecpo.envs import EpisodeReplay
 from torchrl_ecpo.modules import (
     make_deterministic_actor,
     make_qvalue_network,
@@ -100,7 +102,7 @@ def make_environment(config: DictConfig, *, seed: int, is_evaluation: bool = Fal
     with_pixels = is_evaluation and config.evaluation.video
     make = {"gym": _make_gym, "dm_control": _make_dm_control}[config.env.kind]
     env = make(config.env, from_pixels=with_pixels, pixels_only=False)
-    transforms: list[Any] = [DoubleToFloat(), RewardSum(), StepCounter()]
+    transforms: list[Any] = [DoubleToFloat(), RewardSum(), StepCounter(), EpisodeReplay()]
     if config.env.kind == "dm_control":
         parts = [key for key in list(env.observation_spec.keys()) if key != "pixels"]
         transforms.insert(0, CatTensors(in_keys=sorted(parts), out_key="observation"))
@@ -268,11 +270,72 @@ def make_replay_buffer(config: DictConfig) -> ReplayBuffer:
         storage=(
             LazyTensorStorage(size)
             if in_memory
-            else LazyMemmapStorage(size, scratch_dir="replay_buffer")
+            else LazyMemmapStorage(
+                size, scratch_dir="replay_buffer", existsok=config.resume is not None
+            )
         ),
         batch_size=config.replay_buffer.batch_size,
         generator=torch.Generator().manual_seed(config.seed),
     )
+
+
+@contextmanager
+def shut_down(collector: Any) -> Iterator[None]:
+    """End a collector however the run ends: its worker processes would keep the script alive."""
+    try:
+        yield
+    finally:
+        collector.shutdown()
+
+
+class CollectorState:
+    """Where a collector stands within its episode; of one with workers, nothing is kept.
+
+    TorchRL's own state dict has the counters and the environment's transforms.
+    """
+
+    def __init__(self, collector: Any) -> None:
+        self.collector = collector
+        self.is_single = isinstance(getattr(collector, "env", None), EnvBase)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What TorchRL saves, and what one step hands to the next."""
+        if not self.is_single:
+            return {}
+        return {**self.collector.state_dict(), "carrier": self.collector._carrier.to_dict()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Put the simulator where it was, and go on from the step that was handed on."""
+        if self.is_single:
+            carrier = state_dict["carrier"]
+            self.collector.load_state_dict(
+                {name: value for name, value in state_dict.items() if name != "carrier"}
+            )
+            self.collector._traj_pool.load_state_dict(state_dict["traj_pool"])
+            self.collector._carrier = self.collector._carrier.empty().update(carrier)
+
+
+class BufferState:
+    """The transitions in a replay buffer, without the room for more, and its generator's state."""
+
+    def __init__(self, replay_buffer: ReplayBuffer) -> None:
+        self.buffer: Any = replay_buffer
+
+    def state_dict(self) -> dict[str, Any]:
+        """A copy of the transitions, the place to write next and the generator's state."""
+        transitions = self.buffer[:].clone() if len(self.buffer) else TensorDict()
+        return {
+            "transitions": transitions.to_dict(),
+            "writer": self.buffer._writer.state_dict(),
+            "generator": self.buffer._rng.get_state(),
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Fill an empty buffer as it was."""
+        if state_dict["transitions"]:
+            self.buffer.extend(TensorDict(state_dict["transitions"]).auto_batch_size_(1))
+        self.buffer._writer.load_state_dict(state_dict["writer"])
+        self.buffer._rng.set_state(state_dict["generator"])
 
 
 # ------------------------------------------------------------------------------------- measurements
@@ -319,12 +382,20 @@ class Every:
         passed, self.passed = self.passed, count // self.interval
         return self.passed > passed
 
+    def state_dict(self) -> dict[str, int]:
+        """How many multiples have passed."""
+        return {"passed": self.passed}
+
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        """Continue from there."""
+        self.passed = state_dict["passed"]
+
 
 class Speed:
     """Growth of a count per second since last asked."""
 
-    def __init__(self) -> None:
-        self.count, self.time = 0, time.perf_counter()
+    def __init__(self, count: int) -> None:
+        self.count, self.time = count, time.perf_counter()
 
     def __call__(self, count: int) -> float:
         """Ask at a count."""

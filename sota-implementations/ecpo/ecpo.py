@@ -18,12 +18,13 @@ from utils import (
     reached,
 )
 
-from torchrl_ecpo.experiment import Run
+from torchrl_ecpo.experiment import Checkpoints, Progress, Run
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
 def main(config: DictConfig) -> None:
     check_config(config)
+    checkpoints = Checkpoints(config)
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
 
@@ -35,19 +36,30 @@ def main(config: DictConfig) -> None:
     max_grad_norm = config.optim.max_grad_norm or float("inf")
 
     groups_of_trajectories = iter(collector)
-    trajectories = project_steps = 0
-    is_annealing = config.anneal_from is None
-    with Run(
+    progress = Progress(trajectories=0, project_steps=0, is_annealing=config.anneal_from is None)
+    run = Run(
         config,
         total=config.total_trajectories,
         unit="trajectories",
         name=f"{config.env.name}/{config.loss.name}/seed_{config.seed}",
         shown=task.shown,
-    ) as run:
-        while trajectories < config.total_trajectories:
+    )
+    with (
+        run,
+        checkpoints.attach(
+            run,
+            progress,
+            loss_module=loss_module,
+            optimizer=optimizer,
+            temperatures=temperatures,
+            collector=collector,
+            evaluation_env=task.evaluation_env,
+        ),
+    ):
+        while progress.trajectories < config.total_trajectories:
             # Lift: the current policy becomes the reference.
             collector.update_policy_weights_()
-            lifted_at = trajectories
+            lifted_at = progress.trajectories
             for _ in range(config.project_steps):
                 # Project: one gradient step on fresh trajectories of the reference.
                 groups = next(groups_of_trajectories)
@@ -55,18 +67,20 @@ def main(config: DictConfig) -> None:
                 optimizer.zero_grad()
                 losses["loss_actor"].backward()
                 grad_norm = torch.nn.utils.clip_grad_norm_(loss_module.parameters(), max_grad_norm)
+                metrics = {**losses.detach(), "grad_norm": grad_norm}
+                run.check(metrics, progress.trajectories)
                 optimizer.step()
 
-                trajectories += config.num_groups * config.group_size
-                project_steps += 1
-                metrics = {**losses.detach(), **task.measure(groups), **temperatures.values()}
-                metrics["grad_norm"] = grad_norm
-                if project_steps % config.evaluation_interval == 0:
+                progress.trajectories += config.num_groups * config.group_size
+                progress.project_steps += 1
+                metrics |= {**task.measure(groups), **temperatures.values()}
+                if progress.project_steps % config.evaluation_interval == 0:
                     metrics |= task.evaluate(groups)
-                run.log(metrics, step=trajectories)
-            is_annealing = is_annealing or reached(config.anneal_from, metrics)
-            if is_annealing:
-                temperatures.step(trajectories - lifted_at)
+                run.log(metrics, step=progress.trajectories)
+            progress.is_annealing = progress.is_annealing or reached(config.anneal_from, metrics)
+            if progress.is_annealing:
+                temperatures.step(progress.trajectories - lifted_at)
+            checkpoints.boundary()
     collector.shutdown()
 
 

@@ -36,7 +36,7 @@ from torchrl.modules import (
     get_env_transforms_from_module,
 )
 
-from torchrl_ecpo.envs import AlgorithmicEnv, BanditEnv, GroupedEnv
+from torchrl_ecpo.envs import AlgorithmicEnv, BanditEnv, EpisodeReplay, GroupedEnv
 from torchrl_ecpo.modules import SharedCategorical, make_softmax_policy, make_tuple_policy
 
 EVALUATION_EPISODES = 100
@@ -56,6 +56,8 @@ class Task:
     """Measures the actor as it stands; the last batch says how difficult a problem should be."""
     shown: Sequence[str]
     """Metrics on the progress bar and in the picture."""
+    evaluation_env: EnvBase | None = None
+    """Its state goes into checkpoints."""
 
 
 def make_task(config: DictConfig) -> Task:
@@ -121,7 +123,9 @@ def make_algorithmic(config: DictConfig) -> Task:
             "greedy_attained": _returns(episodes).sum() / episodes["attainable"][..., 0].sum(),
         }
 
-    return Task(env, actor, measure, evaluate, ("return", "level", "attained", "entropy", "ESS"))
+    return Task(
+        env, actor, measure, evaluate, ("return", "level", "attained", "entropy", "ESS"), other
+    )
 
 
 def make_gym(config: DictConfig) -> Task:
@@ -130,12 +134,16 @@ def make_gym(config: DictConfig) -> Task:
     def make_copy() -> EnvBase:
         return GymEnv(config.env.name, categorical_action_encoding=True)
 
+    def make_evaluation_copy() -> EnvBase:
+        return TransformedEnv(make_copy(), EpisodeReplay())
+
     def limited(env: EnvBase) -> EnvBase:
         transforms: list[Any] = [DoubleToFloat(), StepCounter(config.env.max_steps)]
         return TransformedEnv(env, Compose(*transforms))
 
     groups = GroupedEnv(make_copy, num_groups=config.num_groups, group_size=config.group_size)
-    env, evaluation_env = limited(groups), limited(SerialEnv(10, make_copy))
+    copies = SerialEnv(10, make_evaluation_copy)
+    env, evaluation_env = limited(groups), limited(copies)
     evaluation_env.set_seed(config.seed + 1_000_000)
     actor = make_mlp_policy(env, config.env.hidden_sizes)
 
@@ -145,7 +153,9 @@ def make_gym(config: DictConfig) -> Task:
     def evaluate(groups: TensorDictBase) -> Metrics:
         return {"greedy_return": _returns(_greedy(evaluation_env, actor)).mean()}
 
-    return Task(env, actor, measure, evaluate, ("return", "greedy_return", "entropy", "ESS"))
+    return Task(
+        env, actor, measure, evaluate, ("return", "greedy_return", "entropy", "ESS"), copies
+    )
 
 
 def make_mlp_policy(env: EnvBase, hidden_sizes: Sequence[int]) -> ProbabilisticTensorDictSequential:

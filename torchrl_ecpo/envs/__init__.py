@@ -3,5 +3,6 @@
 from torchrl_ecpo.envs.algorithmic import TASKS, AlgorithmicEnv, AlgorithmicTask
 from torchrl_ecpo.envs.bandit import BanditEnv
 from torchrl_ecpo.envs.grouped import GroupedEnv
+from torchrl_ecpo.envs.replay import EpisodeReplay
 
-__all__ = ["TASKS", "AlgorithmicEnv", "AlgorithmicTask", "BanditEnv", "GroupedEnv"]
+__all__ = ["TASKS", "AlgorithmicEnv", "AlgorithmicTask", "BanditEnv", "EpisodeReplay", "GroupedEnv"]

@@ -142,6 +142,15 @@ class GroupedEnv(EnvBase):
         out = self.copies._step(tensordict.reshape(-1))
         return out.reshape(self.batch_size).set(GROUP_KEY, self._group.clone())
 
+    def get_extra_state(self) -> dict[str, Any]:
+        """The seed and what was played of it; an episode that is being played is not in it."""
+        return {"seed": self._seed, "episode": self._episode.tolist()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Go on with the next instances; the environment must be reset."""
+        self._set_seed(state["seed"])
+        self._episode[:] = state["episode"]
+
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close the copies."""
         super().close(raise_if_closed=raise_if_closed)

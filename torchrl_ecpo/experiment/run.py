@@ -6,12 +6,14 @@ import csv
 import importlib.metadata
 import json
 import math
+import os
 import platform
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
@@ -58,14 +60,45 @@ class MetricsTable:
         self.rows.append(row)
         if self.path is None:
             return
-        is_wider = any(name not in self._columns for name in row)
-        if is_wider:
-            self._columns += [name for name in row if name not in self._columns]
-        with self.path.open("w" if is_wider else "a", newline="") as file:
+        if any(name not in self._columns for name in row):
+            self._rewrite()
+            return
+        with self.path.open("a", newline="") as file:
+            csv.DictWriter(file, self._columns).writerow(row)
+
+    def _rewrite(self) -> None:
+        """Write all rows anew, so that a run which is killed meanwhile loses none."""
+        assert self.path is not None
+        self._columns = list(dict.fromkeys(name for row in self.rows for name in row))
+        written = self.path.with_suffix(".part")
+        with written.open("w", newline="") as file:
             writer = csv.DictWriter(file, self._columns)
-            if is_wider:
-                writer.writeheader()
-            writer.writerows(self.rows if is_wider else [row])
+            writer.writeheader()
+            writer.writerows(self.rows)
+        os.replace(written, self.path)
+
+    def cut_back(self, step: int) -> None:
+        """Continue the file as it was at a step: later rows and half a row are dropped.
+
+        Raises:
+            ValueError: if the file does not reach to that step.
+        """
+        if self.path is None:
+            return
+        self.rows = []
+        if self.path.is_file():
+            with self.path.open(newline="") as file:
+                for cells in csv.DictReader(file):
+                    if None in cells.values() or int(cells["step"]) > step:
+                        break
+                    row = {name: float(cell) for name, cell in cells.items() if cell}
+                    self.rows.append({**row, "step": int(cells["step"])})
+        if step != (self.rows[-1]["step"] if self.rows else 0):
+            raise ValueError(
+                f"{self.path} does not reach to step {step}, where the run goes on: put back the "
+                "rows that are missing."
+            )
+        self._rewrite()
 
 
 def read_metrics(run_directory: Path | str) -> dict[str, list[float]]:
@@ -152,14 +185,14 @@ class Run:
             wandb_kwargs={"project": config.logger.project, "mode": config.logger.wandb_mode},
         )
         assert logger is not None
-        logger.log_hparams(_flatten(OmegaConf.to_container(config, resolve=True)))
+        logger.log_hparams(flatten(OmegaConf.to_container(config, resolve=True)))
         return logger
 
     def log(self, metrics: Metrics | TensorDictBase, step: int) -> None:
         """Record the metrics of a step, whose number must grow.
 
         Raises:
-            FloatingPointError: if a loss is NaN or infinite; what was recorded stays.
+            FloatingPointError: as :meth:`check`; what was recorded stays.
         """
         values = {str(name): float(value) for name, value in metrics.items()}
         self.table.log_metrics(values, step)
@@ -171,12 +204,38 @@ class Run:
         self._bar.set_postfix(shown, refresh=False)
         self._bar.update(step - self.step)
         self.step = step
+        self.check(values, step)
+
+    def check(self, values: Metrics | TensorDictBase, step: int) -> None:
+        """Stop the run before it is spoilt; other metrics than these may be what they like.
+
+        Raises:
+            FloatingPointError: if a loss or the norm of the gradient is NaN or infinite.
+        """
         for name, value in values.items():
-            if name.startswith("loss") and not math.isfinite(value):
+            is_checked = str(name).startswith(("loss", "grad_norm"))
+            if is_checked and not math.isfinite(value):
                 raise FloatingPointError(
-                    f"{name} is {value} at {self.unit} {step}: the run stops before the parameters "
-                    "are spoilt further. A lower learning rate or a higher temperature may help."
+                    f"{name} is {float(value)} at {self.unit} {step}: the run stops before the "
+                    "parameters are spoilt further. A lower learning rate or a higher temperature "
+                    "may help."
                 )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where the record stands."""
+        seconds = time.monotonic() - self._started
+        return {"step": self.step, "latest": dict(self._latest), "seconds": seconds}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on there: the record is cut back to it.
+
+        Raises:
+            ValueError: if the record does not reach there.
+        """
+        self.table.cut_back(state_dict["step"])
+        self.step, self._latest = state_dict["step"], dict(state_dict["latest"])
+        self._started = time.monotonic() - state_dict["seconds"]
+        self._bar.initial = self._bar.n = self.step
 
     def __enter__(self) -> Run:
         """Return the run itself."""
@@ -211,10 +270,10 @@ class Run:
         print(f"{self.name}: learning curve in {picture}")
 
 
-def _flatten(config: object, prefix: str = "") -> dict[str, float | str]:
+def flatten(config: object, prefix: str = "") -> dict[str, float | str]:
     """A nested configuration as ``{"loss.tau": 0.5, ...}``, which is all TensorBoard takes."""
     if isinstance(config, Mapping):
-        parts = (_flatten(value, f"{prefix}.{name}") for name, value in config.items())
+        parts = (flatten(value, f"{prefix}.{name}") for name, value in config.items())
         return {name: value for part in parts for name, value in part.items()}
     is_plain = isinstance(config, (bool, int, float, str))
     return {prefix.removeprefix("."): config if is_plain else str(config)}

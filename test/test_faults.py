@@ -1,0 +1,143 @@
+"""Runs that are really killed, and disks that are really full: ``make test-faults``."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from torchrl.checkpoint import Checkpoint
+
+pytestmark = pytest.mark.slow
+
+SCRIPTS = Path(__file__).parents[1] / "sota-implementations"
+KILLS = 20
+CONTROL = (
+    *("ecac", "log_interval=8", "evaluation.interval=160", "evaluation.episodes=1"),
+    *("collector.init_random_frames=80", "hidden_sizes=[16,16]", "replay_buffer.batch_size=16"),
+    "loss.options.num_actor_states=8",
+)
+RUNS = {
+    "bandit": ("ecpo", "env.num_actions=100", "group_size=10", "total_trajectories=2000"),
+    "copy": (
+        *("ecpo", "env=copy", "env.hidden_size=8", "num_groups=2", "group_size=5"),
+        *("project_steps=2", "total_trajectories=2000", "evaluation_interval=20"),
+    ),
+    "pendulum": (*CONTROL, "env=pendulum", "total_frames=800"),
+    "hopper": (*CONTROL, "env=hopper", "total_frames=800"),
+}
+
+
+def fork(directory, script, *options):
+    """Start a script in a process of its own, in a directory; return the process id."""
+    directory.mkdir(exist_ok=True)
+    process = os.fork()
+    if process:
+        return process
+    try:
+        os.chdir(directory)
+        log = os.open("log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        sys.stdout = sys.stderr = os.fdopen(log, "w", buffering=1)
+        torch.set_num_threads(1)
+        sys.path.insert(0, str(SCRIPTS / script))
+        with initialize_config_dir(str(SCRIPTS / script / "config"), version_base="1.3"):
+            often = ("checkpoint.interval=0", "checkpoint.max_share=1", "resume=auto")
+            config = compose("config", [*often, *options])
+        importlib.import_module(script).main.__wrapped__(config)
+        code = 0
+    except BaseException:
+        traceback.print_exc()
+        code = 1
+    sys.stdout.flush()
+    os._exit(code)
+
+
+def finish(directory, *run):
+    """Run to the end; return the exit status and what was printed."""
+    _, status = os.waitpid(fork(directory, *run), 0)
+    return os.waitstatus_to_exitcode(status), (directory / "log").read_text()
+
+
+def record(directory):
+    with (directory / "metrics.csv").open(newline="") as file:
+        return [
+            {name: cell for name, cell in row.items() if name != "steps_per_second"}
+            for row in csv.DictReader(file)
+        ]
+
+
+def number_of_rows(directory):
+    path = directory / "metrics.csv"
+    return path.read_bytes().count(b"\n") - 1 if path.exists() else 0
+
+
+def weights(directory):
+    path = max((directory / "checkpoints").glob("checkpoint-*"))
+    component = Checkpoint.manifest(path)["components"]["loss_module"]
+    return torch.load(path / component["path"] / "state.pt")
+
+
+def assert_same_run(one, other):
+    assert record(one) == record(other)
+    torch.testing.assert_close(weights(one), weights(other), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_killed_at_twenty_random_moments(tmp_path, capsys, name):
+    run, whole, killed = RUNS[name], tmp_path / "whole", tmp_path / "killed"
+    code, output = finish(whole, *run)
+    assert code == 0, output
+    rows = len(record(whole))
+    generator = random.Random(name)
+    within_writes = 0
+    for moment in sorted(generator.sample(range(rows - 5), KILLS)):
+        process = fork(killed, *run)
+        while number_of_rows(killed) < moment:
+            time.sleep(0.005)
+            assert os.waitpid(process, os.WNOHANG)[0] == 0, (killed / "log").read_text()
+        time.sleep(generator.uniform(0.0, 0.02))
+        os.kill(process, signal.SIGKILL)
+        assert os.WTERMSIG(os.waitpid(process, 0)[1]) == signal.SIGKILL
+        within_writes += any((killed / "checkpoints").glob(".checkpoint-*"))
+    code, output = finish(killed, *run)
+    assert code == 0, output
+    assert "Resumed from" in output
+    assert_same_run(killed, whole)
+    assert within_writes >= 1
+    with capsys.disabled():
+        print(
+            f"\n{name}: {KILLS} times killed, {within_writes} of them within a checkpoint's "
+            f"writing; all {rows} rows and the final weights equal the run's that was not killed"
+        )
+
+
+def test_a_disk_that_is_full(tmp_path, capsys):
+    run, disk = RUNS["pendulum"], tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.call(["mount", "-t", "tmpfs", "-o", "size=160k", "tmpfs", str(disk)]):
+        pytest.skip("a small disk can be made by root alone")
+    try:
+        code, output = finish(disk, *run)
+        assert code != 0
+        assert "could not be written" in output or "No space left on device" in output, output
+        (*_, last) = output.strip().splitlines()
+        subprocess.check_call(["mount", "-o", "remount,size=10m", str(disk)])
+        code, output = finish(disk, *run)
+        assert code == 0, output
+        assert "Resumed from" in output
+        assert finish(tmp_path / "whole", *run)[0] == 0
+        assert_same_run(disk, tmp_path / "whole")
+    finally:
+        subprocess.check_call(["umount", str(disk)])
+    with capsys.disabled():
+        print(f"\nfull disk: the run ended with {last!r} and was resumed on a larger one")

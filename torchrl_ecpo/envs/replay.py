@@ -1,0 +1,100 @@
+"""The state of a simulator, as the episode that led to it."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import GymWrapper, Transform
+
+__all__ = ["EpisodeReplay"]
+
+
+class EpisodeReplay(Transform):
+    """Makes the state of a gymnasium or dm_control task part of the environment's state dict.
+
+    A simulator's state is spread over arrays, counters of wrappers and attributes of a task, and
+    each has others. What every task here can do is to play an episode again: the state dict holds
+    the random generator's state before the last reset and the actions since; loading it resets and
+    repeats them. That costs as much as the steps themselves, and is exact, as the rules of these
+    tasks are deterministic but for that generator.
+
+    Only the simulator is put where it was: what an episode has summed or counted so far travels in
+    the tensordict that the caller holds.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.envs import GymEnv, TransformedEnv
+        >>> env, other = (TransformedEnv(GymEnv("Pendulum-v1"), EpisodeReplay()) for _ in range(2))
+        >>> state = env.rollout(5)[-1]
+        >>> other.load_state_dict(env.state_dict())
+        >>> action = TensorDict({"action": torch.zeros(1)})
+        >>> after, again = (each.step(action.clone())["next"] for each in (env, other))
+        >>> bool((after["observation"] == again["observation"]).all())
+        True
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._start: str | None = None
+        self._actions: list[Tensor] = []
+
+    def _reset_env_preprocess(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._start, self._actions = self._random_state(), []
+        return tensordict
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return tensordict_reset
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._actions.append(tensordict["action"].clone())
+        return next_tensordict
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """The random generator's state before the last reset, and the actions since."""
+        is_begun = self._start is not None
+        return {
+            "is_begun": is_begun,
+            "start": self._start if is_begun else self._random_state(),
+            "actions": list(self._actions),
+        }
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Play the episode again, up to where it was."""
+        self._set_random_state(state["start"])
+        if not state["is_begun"]:
+            return
+        env: Any = self.container
+        step = env.base_env.reset()
+        for action in state["actions"]:
+            step = env.base_env.step(TensorDict({**step, "action": action}))["next"]
+            step = step.exclude("reward")
+        self._start, self._actions = state["start"], list(state["actions"])
+
+    def _random_state(self) -> str:
+        generator = self._generator()
+        is_legacy = isinstance(generator, np.random.RandomState)
+        state = generator.get_state(legacy=False) if is_legacy else generator.bit_generator.state
+        return json.dumps(state, default=np.ndarray.tolist)
+
+    def _set_random_state(self, state: str) -> None:
+        generator = self._generator()
+        if isinstance(generator, np.random.RandomState):
+            generator.set_state(json.loads(state))
+        else:
+            generator.bit_generator.state = json.loads(state)
+
+    def _generator(self) -> Any:
+        container: Any = self.container
+        env = container.base_env
+        if isinstance(env, GymWrapper):
+            return env._env.unwrapped.np_random
+        native = env._env
+        while not hasattr(native, "task"):  # rendering wraps dm_control's environment
+            native = native._env
+        return native.task.random

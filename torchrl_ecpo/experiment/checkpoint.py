@@ -1,0 +1,320 @@
+"""Checkpoints of a run, and resuming from them: what ``docs/resuming.md`` promises to a user."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from types import FrameType, SimpleNamespace, TracebackType
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import to_absolute_path
+from omegaconf import DictConfig, OmegaConf
+from torch import nn
+from torchrl.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    CheckpointRotation,
+    GlobalRNGState,
+    StateDictCheckpointAdapter,
+)
+
+from torchrl_ecpo.experiment.run import Run, flatten
+
+__all__ = ["Checkpoints", "Progress"]
+
+FOLDER = "checkpoints"
+# A run that differs in these alone is the same run.
+FREE_OPTIONS = ("resume", "checkpoint")
+# Useless once a run has finished, and most of its checkpoint.
+ONLY_TO_GO_ON = {"replay_buffer"}
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Progress(SimpleNamespace):
+    """Counters of a script that its checkpoints hold; plain numbers, and lists of them.
+
+    Examples:
+        >>> progress = Progress(frames=0, returns=[])
+        >>> progress.frames += 8
+        >>> progress.state_dict()
+        {'frames': 8, 'returns': []}
+    """
+
+    def state_dict(self) -> dict[str, Any]:
+        """The counters, by name."""
+        return dict(vars(self))
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue from saved counters."""
+        vars(self).update(state_dict)
+
+
+class Checkpoints:
+    """The checkpoints of a run: written as it goes, when it is stopped, and at its end.
+
+    Made before anything else of a run, it finds what ``config.resume`` asks for and refuses what
+    cannot be resumed. :meth:`attach` then puts all parts of the run where they were, and
+    :meth:`boundary` is called wherever the run may be interrupted. SIGTERM and SIGINT wait for the
+    next boundary; a second one does not.
+
+    Args:
+        config: needs ``resume`` (None, a run directory or ``"auto"``) and ``checkpoint`` with
+            ``interval`` (seconds from one checkpoint to the next; None: none but the last),
+            ``max_share`` (of the time that writing may take: a longer one makes them rarer) and
+            ``keep``, how many are kept.
+        directory: of the run.
+
+    Raises:
+        ValueError: for options that make no sense.
+        CheckpointError: if there is nothing to resume from, if it is no checkpoint of such a run,
+            or if the configuration is not the checkpoint's.
+    """
+
+    def __init__(self, config: DictConfig, directory: Path | str = ".") -> None:
+        _check_options(config.checkpoint)
+        self.options, self.resume = config.checkpoint, config.resume
+        self.directory = Path(directory).resolve()
+        folder = self.directory / FOLDER
+        self.rotation = CheckpointRotation(folder, keep_last=config.checkpoint.keep)
+        self.config: Any = OmegaConf.to_container(config, resolve=True)
+        self.source = None if config.resume is None else self._find()
+        self._stopped_by: signal.Signals | None = None
+        self._handlers: dict[signal.Signals, Any] = {}
+        self._is_first = True
+
+    def _find(self) -> Path | None:
+        """The checkpoint to resume from."""
+        given = self.resume
+        if given != "auto" and Path(to_absolute_path(given)).resolve() != self.directory:
+            raise CheckpointError(
+                f"resume={given} is not this run's directory, {self.directory}. Leave out "
+                "hydra.run.dir; to resume all runs of a sweep, give its hydra.sweep.dir and "
+                "resume=auto."
+            )
+        source = self.rotation.latest()
+        if source is None and given != "auto":
+            raise CheckpointError(
+                f"resume={given}: there is nothing to resume from, for {self.rotation.directory} "
+                "holds no checkpoint that can be read. Give the directory of a run that has "
+                "written one, or leave out resume."
+            )
+        if source is None:
+            print(f"resume=auto found no checkpoint: a new run begins in {self.directory}")
+            return None
+        saved = Checkpoint.manifest(source)["metadata"].get("config")
+        if saved is None:
+            raise CheckpointError(f"{source} is no checkpoint of a run of this script.")
+        differing = _differences(saved, self.config)
+        if differing:
+            raise CheckpointError(
+                f"The configuration differs from that of {source}: {'; '.join(differing)}. "
+                "Resume with the options that the run was started with."
+            )
+        return source
+
+    def attach(self, run: Run, progress: Progress, **parts: Any) -> Checkpoints:
+        """Say what a checkpoint holds, and resume from one if that was asked for.
+
+        Args:
+            run: the run, whose record is cut back to the checkpoint.
+            progress: its counters, one of which has the name of the run's unit.
+            parts: everything else, with ``state_dict()`` and ``load_state_dict()``; None is left
+                out. The state of the global random generators is added.
+
+        Raises:
+            CheckpointError: if the checkpoint is damaged.
+        """
+        self.run, self.progress, self.parts = run, progress, parts
+        self.checkpoint = Checkpoint()
+        parts = {"run": run, "progress": progress, "random": GlobalRNGState(), **parts}
+        for name, part in parts.items():
+            if part is not None:
+                # One file each. It is read without unpickling anything but tensors and numbers.
+                adapter = StateDictCheckpointAdapter("torch")
+                self.checkpoint.register(name, part, adapter=adapter)
+        if self.source is not None:
+            self._load(self.source)
+        self._saved_step = self.step if self.source is not None else None
+        self._saved_at, self._pause = time.monotonic(), 0.0
+        return self
+
+    @property
+    def step(self) -> int:
+        """Where the run stands, in its unit."""
+        return getattr(self.progress, self.run.unit)
+
+    def _load(self, source: Path) -> None:
+        metadata = Checkpoint.manifest(source)["metadata"]
+        names = set(self.checkpoint.components)
+        if metadata["finished"]:
+            names -= ONLY_TO_GO_ON
+        try:
+            # What is rebuilt may draw random numbers, so their generators come last.
+            self.checkpoint.load(source, components=names - {"random"})
+            self.checkpoint.load(source, components={"random"})
+        except (CheckpointError, OSError) as error:
+            raise CheckpointError(
+                f"{source} cannot be restored: {error}. If it is damaged, remove it to resume from "
+                "the checkpoint before it."
+            ) from error
+        print(f"Resumed from {source}" + (", which had finished" if metadata["finished"] else ""))
+
+    def boundary(self) -> None:
+        """A moment at which the run may be interrupted; writes a checkpoint if one is due.
+
+        Raises:
+            SystemExit: after a checkpoint, if SIGTERM or SIGINT has come; 128 and its number.
+        """
+        if self._stopped_by is not None:
+            self.save()
+            print(f"Stopped by {self._stopped_by.name}. Resume with: {self.command}")
+            raise SystemExit(128 + self._stopped_by)
+        interval = self.options.interval
+        waited = time.monotonic() - self._saved_at
+        if interval is not None and waited >= max(interval, self._pause):
+            self.save()
+
+    def save(self, *, finished: bool = False) -> None:
+        """Write a checkpoint, unless the last one is of the same step.
+
+        Raises:
+            FloatingPointError: if a parameter is not finite.
+            CheckpointError: if it cannot be written. Those before it are untouched.
+        """
+        if self.step == self._saved_step and not finished:
+            return
+        self._check_parameters()
+        started = time.monotonic()
+        names = set(self.checkpoint.components) - (ONLY_TO_GO_ON if finished else set())
+        try:
+            if self._is_first:
+                self._clear()
+            self.rotation.save(
+                self.checkpoint,
+                step=self.step,
+                components=names,
+                metadata={"config": self.config, "step": self.step, "finished": finished},
+            )
+        except (OSError, RuntimeError) as error:
+            raise CheckpointError(
+                f"The checkpoint at {self.run.unit} {self.step} could not be written: {error}. "
+                f"The last good one is {self.rotation.latest()}."
+            ) from error
+        if finished:
+            CheckpointRotation(self.rotation.directory, keep_last=1).prune()
+        self._saved_step, self._saved_at = self.step, time.monotonic()
+        self._pause = (self._saved_at - started) / self.options.max_share
+
+    def _clear(self) -> None:
+        """Remove what a killed write left; and of a run begun anew in its directory, the old."""
+        self._is_first = False
+        if self.source is None:
+            shutil.rmtree(self.rotation.directory, ignore_errors=True)
+        for remains in self.rotation.directory.glob(f".{self.rotation.prefix}-*"):
+            shutil.rmtree(remains, ignore_errors=True)
+
+    def _check_parameters(self) -> None:
+        for part, module in self.parts.items():
+            for name, value in module.named_parameters() if isinstance(module, nn.Module) else ():
+                if not value.isfinite().all():
+                    raise FloatingPointError(
+                        f"No checkpoint is written at {self.run.unit} {self.step}: {name} of "
+                        f"{part} is not finite. The last good one is {self.rotation.latest()}."
+                    )
+
+    @property
+    def command(self) -> str:
+        """What a user types to resume."""
+        overrides: list[str] = []
+        if HydraConfig.initialized():
+            overrides = list(HydraConfig.get().overrides.task)
+        kept = [option for option in overrides if not option.lstrip("+").startswith("resume=")]
+        return shlex.join(["python", sys.argv[0], *kept, f"resume={self.directory}"])
+
+    def __enter__(self) -> Checkpoints:
+        """Take over SIGTERM and SIGINT."""
+        if threading.current_thread() is threading.main_thread():
+            self._handlers = {name: signal.signal(name, self._stop) for name in SIGNALS}
+        return self
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        self._stopped_by = signal.Signals(number)
+        self._restore_handlers()
+        print(f"{self._stopped_by.name}: the run stops at the next checkpoint", file=sys.stderr)
+
+    def _restore_handlers(self) -> None:
+        for name, handler in self._handlers.items():
+            signal.signal(name, handler)
+        self._handlers = {}
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Write a last checkpoint: at the end, and if a loss refused numbers that are not finite.
+
+        The losses are asked before the parameters change, so that the state is still good.
+        """
+        self._restore_handlers()
+        if error is None:
+            self.save(finished=True)
+        elif isinstance(error, (FloatingPointError, ValueError)):
+            try:
+                self.save()
+            except (FloatingPointError, CheckpointError) as refused:
+                print(refused, file=sys.stderr)
+
+
+def run_directory(resume: str | None, parent: str, name: str) -> str:
+    """Where hydra starts a run: in a new directory, or in that of the run to resume.
+
+    Args:
+        resume: None, a run directory, or ``"auto"``: the last one in `parent` with a checkpoint.
+        parent: of run directories, whose names sort by age.
+        name: of a new run directory.
+
+    Raises:
+        FileNotFoundError: if the run directory does not exist.
+    """
+    if resume is None:
+        return f"{parent}/{name}"
+    if resume == "auto":
+        runs = sorted(path.parent for path in Path(parent).glob(f"*/{FOLDER}"))
+        return str(runs[-1] if runs else Path(parent, name))
+    if not Path(resume).is_dir():
+        raise FileNotFoundError(f"resume={resume}: there is nothing to resume from, no directory.")
+    return str(Path(resume).absolute())
+
+
+OmegaConf.register_new_resolver("run_directory", run_directory, replace=True)
+
+
+def _check_options(options: DictConfig) -> None:
+    interval, keep, max_share = options.interval, options.keep, options.max_share
+    if interval is not None and not (isinstance(interval, (int, float)) and interval >= 0):
+        raise ValueError(f"checkpoint.interval must be seconds or null, got {interval!r}.")
+    if not isinstance(keep, int) or keep < 1:
+        raise ValueError(f"checkpoint.keep must be an integer of at least 1, got {keep!r}.")
+    if not isinstance(max_share, (int, float)) or not 0 < max_share <= 1:
+        raise ValueError(f"checkpoint.max_share must lie in (0, 1], got {max_share!r}.")
+
+
+def _differences(saved: dict[str, Any], present: dict[str, Any]) -> list[str]:
+    """What differs between two configurations, but for `FREE_OPTIONS`."""
+    old, new = (
+        flatten({name: value for name, value in config.items() if name not in FREE_OPTIONS})
+        for config in (saved, present)
+    )
+    return [
+        f"{name} was {old.get(name, 'absent')}, is {new.get(name, 'absent')}"
+        for name in sorted(old.keys() | new.keys())
+        if name not in old or name not in new or old[name] != new[name]
+    ]
