@@ -127,7 +127,11 @@ def script_loop(config: DictConfig) -> Iteration:
 
 def peer_loop() -> Iteration:
     """As many frames of Stable-Baselines3's SAC."""
-    from stable_baselines3 import SAC
+    try:
+        from stable_baselines3 import SAC  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        message = "The peer is not installed: pip install 'torchrl-ecpo[bench]'."
+        raise ModuleNotFoundError(message) from error
 
     model = SAC("MlpPolicy", "HalfCheetah-v5", learning_starts=0, device="cpu", seed=0)
     model.learn(1)
