@@ -1366,6 +1366,43 @@ def test_options_are_checked_at_the_door(case, options, message):
         case.build(**options)
 
 
+@losses
+@pytest.mark.parametrize("value", [0, -1, 2.5, None])
+def test_number_of_q_networks_is_checked_at_the_door(case, value):
+    message = f"num_qvalue_nets must be an integer of at least 1, got {value}"
+    with pytest.raises(ValueError, match=message):
+        case.build(num_qvalue_nets=value)
+
+
+@losses
+@pytest.mark.parametrize("name", ["tau", "tau_prime"])
+@pytest.mark.parametrize("value", ["a", None, torch.ones(2)], ids=["string", "none", "two"])
+def test_temperatures_must_be_numbers(case, name, value):
+    """Given to the constructor or assigned; the old one stays."""
+    message = f"{name} must be a number, got ('a'|None|tensor)"
+    with pytest.raises(ValueError, match=message):
+        case.build(**{name: value})
+    loss = case.build()
+    with pytest.raises(ValueError, match=message):
+        setattr(loss, name, value)
+    assert getattr(loss, name).item() == getattr(case, name)
+
+
+@losses
+@pytest.mark.parametrize(
+    ("mask", "message"),
+    [
+        (torch.ones(5, dtype=torch.bool), r"must have the shape \(6,\).*got \(5,\)"),
+        (torch.ones(6), "must be boolean.*got torch.float32"),
+    ],
+    ids=["shape", "dtype"],
+)
+def test_wrong_masks(case, mask, message):
+    batch = TensorDict(_batch(case).to_dict()).set(MASK, mask)
+    with pytest.raises(ValueError, match=rf"The mask \('collector', 'mask'\) {message}"):
+        case.build()(batch)
+
+
 @continuous
 @pytest.mark.parametrize("name", ["num_action_samples", "num_next_action_samples"])
 @pytest.mark.parametrize("value", [0, -1, 2.5, None])

@@ -24,7 +24,7 @@ class SampledActions(NamedTuple):
     latent: Tensor
     """``[M, *B, A]``, the action before the policy's transform (tanh), or the action itself."""
     log_volume: Tensor | float
-    """``[M, *B]``, log-determinant of the transform at the latent: the same for every policy."""
+    """``[M, *B]``, log-determinant of the transform at the latent, the same for every policy."""
 
 
 def is_discrete(distribution: type | Distribution) -> bool:

@@ -11,15 +11,14 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torch.distributions import Distribution
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator, distance_loss
 
 from torchrl_ecpo.functional import (
-    check_temperatures,
     effective_sample_size,
     lift_divergence_estimate,
     lifted_log_weights,
@@ -28,6 +27,7 @@ from torchrl_ecpo.functional import (
     soft_value_estimate,
     temperature_dual,
 )
+from torchrl_ecpo.objectives._base import PolicyLoss, check_choice, check_count, get_entry
 from torchrl_ecpo.objectives.actions import (
     SampledActions,
     is_discrete,
@@ -37,7 +37,6 @@ from torchrl_ecpo.objectives.actions import (
 
 __all__ = ["ActorCriticLoss", "ContinuousActorCriticLoss", "DiscreteActorCriticLoss", "Lift"]
 
-REDUCTIONS = ("none", "mean", "sum")
 LOSS_FUNCTIONS = ("l2", "l1", "smooth_l1")
 SATURATED = 0.95
 
@@ -65,7 +64,7 @@ class Lift(NamedTuple):
         return self.actions
 
 
-class ActorCriticLoss(LossModule):
+class ActorCriticLoss(PolicyLoss):
     """Base class of the actor-critic losses: lift the reference policy by soft Q, and project.
 
     Two subclasses say what stands for the actions at a state: M samples of the reference
@@ -113,9 +112,6 @@ class ActorCriticLoss(LossModule):
     )
     _schedulable_buffers = frozenset({"tau", "tau_prime"})
 
-    actor_network: ProbabilisticTensorDictSequential
-    actor_network_params: TensorDictParams
-    target_actor_network_params: TensorDictParams
     qvalue_network: TensorDictModule
     qvalue_network_params: TensorDictParams
     target_qvalue_network_params: TensorDictParams
@@ -156,37 +152,32 @@ class ActorCriticLoss(LossModule):
         use_prioritized_weights: bool | Literal["auto"],
         deactivate_vmap: bool,
     ) -> None:
-        self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[NestedKey] | None = None
-        super().__init__()
+        super().__init__(actor_network, delay_actor=delay_actor, reduction=reduction)
+        check_count("num_qvalue_nets", num_qvalue_nets)
         self._check_networks(actor_network, qvalue_network, num_qvalue_nets)
-        reduction = "mean" if reduction is None else reduction
-        _check_choice("reduction", reduction, REDUCTIONS)
-        _check_choice("loss_function", loss_function, LOSS_FUNCTIONS)
+        check_choice("loss_function", loss_function, LOSS_FUNCTIONS)
         if value_network is not None and not (delay_value and not delay_qvalue):
             raise ValueError(
                 "With a value_network the value of the next state comes from its delayed copy: "
                 f"leave delay_value=True and delay_qvalue=None, got {delay_value} and "
                 f"{delay_qvalue}."
             )
-        if num_actor_states is not None and (num_actor_states < 1 or reduction == "none"):
+        if num_actor_states is not None and (num_actor_states < 1 or self.reduction == "none"):
             raise ValueError(
                 "num_actor_states must be None or at least 1, and None with reduction='none', "
                 f"where each state has its number; got {num_actor_states}."
             )
         self.num_actor_states = num_actor_states
-        self.reduction = reduction
         self.loss_function = loss_function
         self.skip_done_states = skip_done_states
         self.use_prioritized_weights = use_prioritized_weights
         self.deactivate_vmap = deactivate_vmap
         self.num_qvalue_nets = num_qvalue_nets
-        self.delay_actor = delay_actor
         self.delay_value = value_network is not None
         self.delay_qvalue = value_network is None if delay_qvalue is None else delay_qvalue
 
         shared = list(actor_network.parameters()) if separate_losses else None
-        self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
         if value_network is None:
             self.value_network = None
             self.value_network_params = self.target_value_network_params = None
@@ -206,20 +197,23 @@ class ActorCriticLoss(LossModule):
             compare_against=shared,
         )
         if isinstance(target_entropy, str):
-            _check_choice("target_entropy", target_entropy, ("auto",))
+            check_choice("target_entropy", target_entropy, ("auto",))
         elif target_entropy is not None and not math.isfinite(target_entropy):
             raise ValueError(
                 f'target_entropy must be finite, in nats, "auto" or None, got {target_entropy}.'
             )
-        tau, tau_prime = float(tau), float(tau_prime)
-        check_temperatures(tau=tau, tau_prime=tau_prime)
+        temperatures = self._as_temperatures({"tau": tau, "tau_prime": tau_prime})
         if target_kl is not None and not 0 < target_kl < math.inf:
             raise ValueError(f"target_kl must be above 0, in nats, or None, got {target_kl}.")
         self.target_kl = target_kl
         self.target_entropy = target_entropy
-        self._set_temperature("tau", tau, min_tau, is_learned=target_kl is not None)
-        learns_entropy = target_entropy is not None
-        self._set_temperature("tau_prime", tau_prime, min_tau_prime, is_learned=learns_entropy)
+        self._set_temperature("tau", temperatures["tau"], min_tau, is_learned=target_kl is not None)
+        self._set_temperature(
+            "tau_prime",
+            temperatures["tau_prime"],
+            min_tau_prime,
+            is_learned=target_entropy is not None,
+        )
         self._make_vmap()
         self._default_value_estimator()
         action_keys = getattr(actor_network, "dist_sample_keys", None)
@@ -229,14 +223,14 @@ class ActorCriticLoss(LossModule):
     # ----------------------------------------------------------------------------- what differs
 
     @abstractmethod
-    def lift(
+    def _scored_actions(
         self,
         observations: TensorDictBase,
         reference: Distribution,
         qvalue_params: TensorDictParams,
         num_samples: int,
-    ) -> Lift:
-        """Lift the reference policy at each state, by Eq. 8."""
+    ) -> tuple[Tensor, Tensor, SampledActions | None]:
+        """Least soft Q and log-probability ``[M, *B]`` of the actions, and they where sampled."""
 
     @abstractmethod
     def project(
@@ -271,7 +265,7 @@ class ActorCriticLoss(LossModule):
             tensordict: with the entries of :attr:`in_keys`; the priority is written into it.
 
         Returns:
-            The entries of :attr:`out_keys`: losses and, detached, metrics; with
+            The entries of :attr:`out_keys`, losses and, detached, metrics; with
             ``reduction="none"`` each has the shape of the batch.
         """
         transitions, mask = self._read(tensordict)
@@ -330,19 +324,9 @@ class ActorCriticLoss(LossModule):
         Those that are not real are all 0: the gradient of NaN is NaN, also of a NaN that counts 0.
         """
         for key in self.in_keys:
-            if tensordict.get(key, None) is None:
-                present = ", ".join(sorted(map(repr, tensordict.keys(True, True))))
-                raise KeyError(
-                    f"The entry {key!r} is missing; there are {present}. If it has another name, "
-                    "say so with set_keys(...), or where the networks are built."
-                )
+            get_entry(tensordict, key)
         shape = tensordict.get(self._reward_key).shape[:-1]
-        mask = None
-        for key in self._loss_mask_keys():
-            found = tensordict.get(key, None)
-            if found is not None:
-                found = found.reshape(shape)
-                mask = found if mask is None else mask & found
+        mask = self._mask(tensordict, shape)
         if mask is None and tensordict.shape == shape:
             return tensordict, None
 
@@ -363,7 +347,7 @@ class ActorCriticLoss(LossModule):
             # Nothing is to come, whatever stands there: NaN times 0 would be NaN.
             value = value.unsqueeze(-1).masked_fill(ended, 0.0)
             valued = tensordict.copy()
-            valued.set(("next", *_as_tuple(self.tensor_keys.value)), value)
+            valued.set(unravel_key(("next", self.tensor_keys.value)), value)
             return self.value_estimator.value_estimate(valued).squeeze(-1)
 
     def _next_state_value(self, tensordict: TensorDictBase, ended: Tensor) -> Tensor:
@@ -381,6 +365,27 @@ class ActorCriticLoss(LossModule):
             self.target_qvalue_network_params,
             self.num_next_action_samples,
         ).value
+
+    def lift(
+        self,
+        observations: TensorDictBase,
+        reference: Distribution,
+        qvalue_params: TensorDictParams,
+        num_samples: int,
+    ) -> Lift:
+        """Lift the reference policy at each state: Eq. 8, by samples of it or over all actions."""
+        with torch.no_grad():
+            score, log_prob, actions = self._scored_actions(
+                observations, reference, qvalue_params, num_samples
+            )
+            tau, tau_prime = self.temperatures()
+            log_weights = lifted_log_weights(score, log_prob, tau=tau, tau_prime=tau_prime)
+            if actions is None:  # nobody has drawn them: the reference counts by its probability
+                log_weights = log_weights + log_prob
+            weights = self_normalised_weights(log_weights, sample_dim=0)
+            value_of = soft_value if actions is None else soft_value_estimate
+            value = value_of(score, log_prob, tau=tau, tau_prime=tau_prime, sample_dim=0)
+        return Lift(score, log_prob, log_weights, weights, value, actions)
 
     def _qvalue_loss(self, tensordict: TensorDictBase, target: Tensor) -> tuple[Tensor, Tensor]:
         """Eq. 10, summed over the Q networks, and the largest error of them: both ``[*B]``."""
@@ -478,24 +483,14 @@ class ActorCriticLoss(LossModule):
         return temperature_dual(log_temperature, excess.masked_fill(is_at_floor & is_sent_down, 0))
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Refuse a temperature that is not allowed, or that is learned."""
-        if name in self._schedulable_buffers and "_parameters" in self.__dict__:
-            if f"log_{name}" in self._parameters:
-                raise AttributeError(
-                    f"{name} is learned. Build the loss without "
-                    f"{'target_kl' if name == 'tau' else 'target_entropy'} to set or schedule it."
-                )
-            if name in self._buffers:
-                value = float(value)
-                current = {
-                    other: getattr(self, other).item()
-                    for other in sorted(self._schedulable_buffers)
-                    if other in self._buffers
-                }
-                # A learned temperature is positive.
-                has_learned = len(current) < len(self._schedulable_buffers)
-                check_temperatures(allow_zero=has_learned, **{**current, name: value})
-        super().__setattr__(name, value)  # pyright: ignore[reportArgumentType] - of TorchRL's base
+        """Refuse a temperature that is learned, and one that is not allowed."""
+        is_learned = f"log_{name}" in self.__dict__.get("_parameters", {})
+        if is_learned and name in self._schedulable_buffers:
+            raise AttributeError(
+                f"{name} is learned. Build the loss without "
+                f"{'target_kl' if name == 'tau' else 'target_entropy'} to set or schedule it."
+            )
+        super().__setattr__(name, value)
 
     # ---------------------------------------------------------------------------------- reporting
 
@@ -533,7 +528,7 @@ class ActorCriticLoss(LossModule):
                         *self.actor_network.in_keys,
                         *self.qvalue_network.in_keys,
                         *(() if self.value_network is None else self.value_network.in_keys),
-                        *(("next", *_as_tuple(key)) for key in following),
+                        *(unravel_key(("next", key)) for key in following),
                     ]
                 )
             )
@@ -560,10 +555,6 @@ class ActorCriticLoss(LossModule):
         value = [] if self.value_network is None else ["loss_value"]
         losses = ["loss_actor", "loss_qvalue", *value, *(f"loss_{name}" for name in learned)]
         return [*losses, *self._metric_names, "tau", "tau_prime"]
-
-    @property
-    def _reward_key(self) -> NestedKey:
-        return ("next", *_as_tuple(self.tensor_keys.reward))
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         if self._value_estimator is not None:
@@ -644,11 +635,6 @@ class ActorCriticLoss(LossModule):
     # ----------------------------------------------------------------------------- bad input
 
     def _check_networks(self, actor_network: Any, qvalue_network: Any, number: int) -> None:
-        if not hasattr(actor_network, "get_dist"):
-            raise TypeError(
-                "actor_network must have a get_dist method, as ProbabilisticActor and "
-                f"ProbabilisticTensorDictSequential have; got {type(actor_network).__name__}."
-            )
         if isinstance(qvalue_network, (list, tuple)):
             different = len({id(network) for network in qvalue_network})
             if not 2 <= different == len(qvalue_network) == number:
@@ -714,12 +700,8 @@ class ContinuousActorCriticLoss(ActorCriticLoss):
         **options: Any,
     ) -> None:
         super().__init__(actor_network, qvalue_network, value_network, **options)
-        for name, value in {
-            "num_action_samples": num_action_samples,
-            "num_next_action_samples": num_next_action_samples,
-        }.items():
-            if not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be an integer of at least 1, got {value!r}.")
+        check_count("num_action_samples", num_action_samples)
+        check_count("num_next_action_samples", num_next_action_samples)
         self.num_action_samples = num_action_samples
         self.num_next_action_samples = num_next_action_samples
         if self.tensor_keys.action not in self.qvalue_network.in_keys:
@@ -730,24 +712,16 @@ class ContinuousActorCriticLoss(ActorCriticLoss):
             )
         self._check_target_kl(self.target_kl or 0.0)
 
-    def lift(
+    def _scored_actions(
         self,
         observations: TensorDictBase,
         reference: Distribution,
         qvalue_params: TensorDictParams,
         num_samples: int,
-    ) -> Lift:
-        """Lift the reference policy at each state, by M actions that it draws."""
-        with torch.no_grad():
-            actions = sample_actions(reference, num_samples)
-            score = self._qvalue_of(observations, actions.action, qvalue_params)
-            tau, tau_prime = self.temperatures()
-            log_weights = lifted_log_weights(score, actions.log_prob, tau=tau, tau_prime=tau_prime)
-            weights = self_normalised_weights(log_weights, sample_dim=0)
-            value = soft_value_estimate(
-                score, actions.log_prob, tau=tau, tau_prime=tau_prime, sample_dim=0
-            )
-        return Lift(score, actions.log_prob, log_weights, weights, value, actions)
+    ) -> tuple[Tensor, Tensor, SampledActions]:
+        actions = sample_actions(reference, num_samples)
+        score = self._qvalue_of(observations, actions.action, qvalue_params)
+        return score, actions.log_prob, actions
 
     def _qvalue_of(
         self, observations: TensorDictBase, action: Tensor, qvalue_params: TensorDictParams
@@ -802,24 +776,15 @@ class DiscreteActorCriticLoss(ActorCriticLoss):
     _metric_names = ("ESS", "kl_target", "kl_to_reference", "entropy", "qvalue", "state_value")
     num_action_samples = num_next_action_samples = 0  # nothing is sampled
 
-    def lift(
+    def _scored_actions(
         self,
         observations: TensorDictBase,
         reference: Distribution,
         qvalue_params: TensorDictParams,
         num_samples: int,
-    ) -> Lift:
-        """Lift the reference policy at each state."""
-        with torch.no_grad():
-            log_prob = log_probs_of_all(reference)
-            score = self._qvalues(observations, qvalue_params).amin(0).movedim(-1, 0)
-            tau, tau_prime = self.temperatures()
-            log_weights = log_prob + lifted_log_weights(
-                score, log_prob, tau=tau, tau_prime=tau_prime
-            )
-            weights = self_normalised_weights(log_weights, sample_dim=0)
-            value = soft_value(score, log_prob, tau=tau, tau_prime=tau_prime, sample_dim=0)
-        return Lift(score, log_prob, log_weights, weights, value, None)
+    ) -> tuple[Tensor, Tensor, None]:
+        score = self._qvalues(observations, qvalue_params).amin(0).movedim(-1, 0)
+        return score, log_probs_of_all(reference), None
 
     def _qvalues(self, observations: TensorDictBase, qvalue_params: TensorDictParams) -> Tensor:
         """Soft Q ``[N, *B, n]`` of all actions."""
@@ -868,15 +833,6 @@ def _saturation(action: Tensor, policy: Distribution) -> Tensor:
         return torch.zeros_like(action[0, ..., 0])
     position = (2 * action - (high + low)) / (high - low)
     return (position.abs() > SATURATED).to(action.dtype).mean((0, -1))
-
-
-def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    if value not in choices:
-        raise ValueError(f"{name} must be one of {choices}, got {value!r}.")
-
-
-def _as_tuple(key: NestedKey) -> tuple[Any, ...]:
-    return (key,) if isinstance(key, str) else tuple(key)
 
 
 def _expand(mask: Tensor, like: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from torchrl_ecpo.functional import centred_gaussian_projection, mean_seeking_projection
+from torchrl_ecpo.objectives._base import check_choice
 from torchrl_ecpo.objectives.actions import gaussian_parameters, log_prob_of
 from torchrl_ecpo.objectives.actor_critic import (
     ContinuousActorCriticLoss,
@@ -160,8 +161,7 @@ class ECACLoss(ContinuousActorCriticLoss):
         use_prioritized_weights: bool | Literal["auto"] = "auto",
         deactivate_vmap: bool = False,
     ) -> None:
-        if projection not in PROJECTIONS:
-            raise ValueError(f"projection must be one of {PROJECTIONS}, got {projection!r}.")
+        check_choice("projection", projection, PROJECTIONS)
         super().__init__(
             actor_network,
             qvalue_network,

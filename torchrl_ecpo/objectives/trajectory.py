@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams, is_tensor_collection
@@ -17,19 +17,17 @@ from tensordict.nn import (
 )
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.objectives import LossModule
 
 from torchrl_ecpo.functional import (
     Surrogate,
-    check_temperatures,
     effective_sample_size,
     lifted_log_weights,
     self_normalised_weights,
 )
+from torchrl_ecpo.objectives._base import PolicyLoss, get_entry
 
 __all__ = ["LiftProjectLoss", "TrajectoryGroupLoss", "TrajectoryGroups"]
 
-REDUCTIONS = ("none", "mean", "sum")
 OUT_KEYS = (
     "loss_actor",
     "ESS",
@@ -45,7 +43,7 @@ class TrajectoryGroups(NamedTuple):
     """Groups of K trajectories as numbers, one for each trajectory: every field is ``[*G, K]``."""
 
     returns: Tensor
-    """r(rho): the sum of the rewards."""
+    """The return r(rho), the sum of the rewards."""
     log_prob: Tensor
     """log pi_theta(rho), under the policy being trained; carries the gradient."""
     reference_log_prob: Tensor
@@ -58,7 +56,7 @@ class TrajectoryGroups(NamedTuple):
     """True where the trajectory has a real step; None where all have."""
 
 
-class TrajectoryGroupLoss(LossModule):
+class TrajectoryGroupLoss(PolicyLoss):
     """Base class of the losses over groups of K trajectories of one problem instance.
 
     It reads a batch ``[*G, K, T]`` (any number of group dimensions, also none), sums rewards and
@@ -122,12 +120,6 @@ class TrajectoryGroupLoss(LossModule):
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
 
-    actor_network: ProbabilisticTensorDictSequential
-    actor_network_params: TensorDictParams
-    target_actor_network_params: TensorDictParams
-
-    _may_be_zero: ClassVar[bool] = False
-
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
@@ -136,33 +128,10 @@ class TrajectoryGroupLoss(LossModule):
         delay_actor: bool = False,
         reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
-        self._in_keys: list[NestedKey] | None = None
-        super().__init__()
+        super().__init__(actor_network, delay_actor=delay_actor, reduction=reduction)
         self.out_keys = list(OUT_KEYS)
-        if not hasattr(actor_network, "get_dist"):
-            raise TypeError(
-                "actor_network must have a get_dist method, as ProbabilisticActor and "
-                f"ProbabilisticTensorDictSequential have; got {type(actor_network).__name__}."
-            )
-        reduction = "mean" if reduction is None else reduction
-        if reduction not in REDUCTIONS:
-            raise ValueError(f"reduction must be one of {REDUCTIONS} or None, got {reduction!r}.")
-        self.reduction = reduction
-        self.delay_actor = delay_actor
-        values = {name: _as_float(name, value) for name, value in temperatures.items()}
-        check_temperatures(allow_zero=self._may_be_zero, **values)
-        for name, value in values.items():
+        for name, value in self._as_temperatures(temperatures).items():
             self.register_coeff_buffer(name, value)
-        self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        """Refuse a scheduled temperature that is not allowed, and keep the old one."""
-        schedulable = type(self)._all_schedulable_buffers
-        if name in schedulable and name in self.__dict__.get("_buffers", {}):
-            value = _as_float(name, value)
-            current = {other: getattr(self, other).item() for other in sorted(schedulable)}
-            check_temperatures(allow_zero=self._may_be_zero, **{**current, name: value})
-        super().__setattr__(name, value)  # pyright: ignore[reportArgumentType] - of TorchRL's base
 
     # ------------------------------------------------------------------------------- one method
 
@@ -178,7 +147,7 @@ class TrajectoryGroupLoss(LossModule):
             tensordict: ``[*G, K, T]`` with the entries of :attr:`in_keys`; nothing is written.
 
         Returns:
-            ``loss_actor`` and, detached, the diagnostics of :attr:`out_keys`: means over groups,
+            ``loss_actor`` and, detached, the diagnostics of :attr:`out_keys`, means over groups
             or one number a group (``[*G]``) with ``reduction="none"``.
         """
         groups = self._read(tensordict)
@@ -240,18 +209,13 @@ class TrajectoryGroupLoss(LossModule):
         self.out_keys = list(OUT_KEYS)
         return self
 
-    @property
-    def _reward_key(self) -> NestedKey:
-        reward = self.tensor_keys.reward
-        return ("next", *((reward,) if isinstance(reward, str) else reward))
-
     # ---------------------------------------------------------------------------------- reading
 
     def _read(self, tensordict: TensorDictBase) -> TrajectoryGroups:
         """Sum rewards and log-probabilities over the real steps of each trajectory."""
-        reward = _get(tensordict, self._reward_key)
+        reward = get_entry(tensordict, self._reward_key)
         shape = _batch_shape(reward, self._reward_key)
-        step_mask = self._step_mask(tensordict, shape)
+        step_mask = self._mask(tensordict, shape)
 
         def over_steps(values: Tensor) -> Tensor:
             return (values if step_mask is None else values.where(step_mask, 0.0)).sum(-1)
@@ -277,27 +241,6 @@ class TrajectoryGroupLoss(LossModule):
         self._check_values(groups)
         return groups
 
-    def _step_mask(self, tensordict: TensorDictBase, shape: torch.Size) -> Tensor | None:
-        """Conjunction of the masks that :attr:`loss_mask_key` names, those that are there."""
-        step_mask = None
-        for key in self._loss_mask_keys():
-            mask = tensordict.get(key, None)
-            if mask is None:
-                continue
-            if mask.shape == (*shape, 1):
-                mask = mask.squeeze(-1)
-            if mask.shape != shape:
-                raise ValueError(
-                    f"The mask {key!r} must have the shape [*G, K, T] = {tuple(shape)} of the "
-                    f"batch, got {tuple(mask.shape)}."
-                )
-            if mask.dtype != torch.bool:
-                raise ValueError(
-                    f"The mask {key!r} must be boolean (True: the step is real), got {mask.dtype}."
-                )
-            step_mask = mask if step_mask is None else step_mask & mask
-        return step_mask
-
     def _actor_inputs(
         self, tensordict: TensorDictBase, shape: torch.Size, step_mask: Tensor | None
     ) -> TensorDictBase:
@@ -309,7 +252,7 @@ class TrajectoryGroupLoss(LossModule):
         """
         action_keys = _as_list(self.tensor_keys.action)
         for key in action_keys:
-            _get(tensordict, key)
+            get_entry(tensordict, key)
         inputs = tensordict.select(*self.actor_network.in_keys, *action_keys, strict=False)
         inputs = inputs.copy()  # entries that are tensordicts would get the batch size below
         try:
@@ -462,26 +405,8 @@ class LiftProjectLoss(TrajectoryGroupLoss):
 # ------------------------------------------------------------------------------------- small parts
 
 
-def _as_float(name: str, value: Any) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError, RuntimeError):
-        raise ValueError(f"{name} must be a number, got {value!r}.") from None
-
-
 def _as_list(keys: NestedKey | list[NestedKey] | None) -> list[NestedKey]:
     return list(keys) if isinstance(keys, list) else [keys]  # type: ignore[list-item]
-
-
-def _get(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    value = tensordict.get(key, None)
-    if value is None:
-        present = ", ".join(sorted(map(repr, tensordict.keys(True, True))))
-        raise KeyError(
-            f"The entry {key!r} is missing; there are {present}. If it has another name, say so "
-            "with set_keys(...)."
-        )
-    return value
 
 
 def _sum_parts(log_prob: TensorDictBase) -> Tensor:
