@@ -334,10 +334,11 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
     """Draws complete groups of whole trajectories from a flat replay buffer, as `[G, K, T]`.
 
     The storage holds steps, trajectory after trajectory, as
-    ``Collector(trajs_per_batch=..., replay_buffer=...)`` and :class:`TrajectoryGroupCollector`
-    write them. A batch has `G` distinct groups, uniformly drawn, and `K` distinct trajectories of
-    each. Groups with fewer than `K` trajectories wait; of larger ones `K` are drawn. A trajectory
-    that has not ended, or that the writer has begun to overwrite, is never returned.
+    ``Collector(trajs_per_batch=..., replay_buffer=...)`` and
+    :class:`~torchrl_ecpo.collectors.TrajectoryGroupCollector` write them. A batch has `G` distinct
+    groups, uniformly drawn, and `K` distinct trajectories of each. Groups with fewer than `K`
+    trajectories wait; of larger ones `K` are drawn. A trajectory that has not ended, or that the
+    writer has begun to overwrite, is never returned.
 
     ``TensorDictReplayBuffer.sample()`` returns `[G, K, T]` with ``("collector", "mask")``; padded
     steps repeat the last real one. A plain ``ReplayBuffer`` puts the mask in the ``info`` of

@@ -543,7 +543,7 @@ def soft_value(
         mask: ``[E*, K]``, True where an action is allowed.
 
     Returns:
-        ``[E*]``, in the unit of the score: the maximum of
+        ``[E*]``, in the unit of the score, the maximum of
         E score - tau KL(pi, pi_bar) + tau' H(pi) over all distributions pi.
 
     Examples:

@@ -489,7 +489,7 @@ class AlgorithmicEnv(EnvBase):
 
     @property
     def read_head(self) -> Tensor:
-        """Position of the read head, 0 at the start: `[G, K]`, or (column, row) `[G, K, 2]`."""
+        """Position of the read head, 0 at the start, `[G, K]`, or (column, row), `[G, K, 2]`."""
         head = self._cursor[:, :2].view(*self.batch_size, 2) - 1
         return head if self.task.rows > 1 else head[..., 0]
 

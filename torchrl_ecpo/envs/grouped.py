@@ -39,7 +39,7 @@ class GroupedEnv(EnvBase):
         parallel: whether each copy runs in a process of its own (``ParallelEnv``) instead of one
             after the other in this one (``SerialEnv``). Default: False.
 
-    The seeds come from the operating system until :meth:`set_seed` is called, as gymnasium's do.
+    The seeds come from the operating system until ``set_seed`` is called, as gymnasium's do.
     Within a reset, torch's generators are seeded too and put back afterwards, so that environments
     written in torch start from the same state as well and the policy's randomness is untouched.
     The copies' transitions may be random: only the start is shared.

@@ -156,7 +156,7 @@ class TupleCategorical(Distribution):
 
     @property
     def deterministic_sample(self) -> Tensor:
-        """The most probable action: what `ExplorationType.DETERMINISTIC` asks for."""
+        """The most probable action, which `ExplorationType.DETERMINISTIC` asks for."""
         return self.mode
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -286,8 +286,8 @@ def make_tuple_policy(
         dtype: of the parameters.
 
     Returns:
-        The actor. Its environment needs `InitTracker()` and, to sample, the state's primer:
-        `torchrl.modules.get_env_transforms_from_module(actor)` gives both, and
+        The actor. Its environment needs `InitTracker()` and, to sample, the state's primer. Both
+        come from `torchrl.modules.get_env_transforms_from_module(actor)`, and
         `TrajectoryGroupCollector` does without either.
 
     Raises:

@@ -1,0 +1,69 @@
+"""How Sphinx makes the site: ``make docs``."""
+
+from __future__ import annotations
+
+import warnings
+from importlib.metadata import version as installed_version
+from pathlib import Path
+from typing import Any
+
+from docutils import nodes
+from sphinx.addnodes import pending_xref
+from sphinx.application import Sphinx
+from sphinx.util import inspect
+
+# TorchRL 0.14's own collectors warn about themselves on import.
+warnings.filterwarnings("ignore", ".*inherits from WeightUpdaterBase.*", DeprecationWarning)
+
+project = "torchrl_ecpo"
+author = "the authors of torchrl_ecpo"
+version = release = installed_version("torchrl-ecpo")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.napoleon"]
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = project
+
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 4  # links like results.md#the-bandit, as GitHub has them
+
+autodoc_default_options = {"members": True, "member-order": "bysource", "show-inheritance": True}
+add_module_names = False
+default_role = "code"  # what stands in single backquotes
+python_use_unqualified_type_names = True
+python_maximum_signature_line_length = 88
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+
+nitpicky = True
+# Types of other projects, and the short names by which annotations call them.
+nitpick_ignore_regex = [
+    ("py:.*", r"(collections|numpy|omegaconf|pathlib|tensordict|torch|torchrl|types|typing)\..*"),
+    ("py:(class|exc)", "CheckpointError|EnvBase|NestedKey|Tensor|TensorDictBase"),
+    ("py:class", r"torchrl_ecpo\..*\._.+"),  # what is private has no page
+    ("py:attr", "in_keys|loss_mask_key|out_keys"),  # of TorchRL's LossModule
+]
+
+
+def name_folders(app: Sphinx, page: nodes.document) -> None:
+    """Let a link to a folder of the repository, which a site cannot show, be its name."""
+    for link in list(page.findall(pending_xref)):
+        folder = Path(app.env.doc2path(link.get("refdoc", "index"))).parent / link["reftarget"]
+        if link["reftype"] == "myst" and folder.is_dir():
+            link.replace_self(link.children)
+
+
+def signature_of_init(
+    app: Sphinx, what: str, name: str, found: Any, options: Any, signature: str, returns: str
+) -> tuple[str, str] | None:
+    """Show the arguments of a constructor that a metaclass of TorchRL hides."""
+    if what != "class" or signature != "(*args, **kwargs)":
+        return None
+    arguments = inspect.signature(found.__init__, bound_method=True)
+    return inspect.stringify_signature(arguments, show_return_annotation=False), returns
+
+
+def setup(app: Sphinx) -> None:
+    """Called by Sphinx."""
+    app.connect("autodoc-process-signature", signature_of_init)
+    app.connect("doctree-read", name_folders)
