@@ -8,7 +8,7 @@ export OMP_NUM_THREADS ?= 1
 export MUJOCO_GL ?= disabled
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow test-faults lint format types clean
+.PHONY: help install demo study report test test-slow test-faults lint format types docs clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -32,6 +32,13 @@ demo: install ## compare ECPO, UREX and MENT on the 10,000-armed bandit, then tr
 	@$(RUN) -m torchrl_ecpo.experiment.compare runs/demo/bandit --metric expected_reward \
 		--title "10,000-armed bandit" --x-label "sampled actions"
 
+study: install ## make the runs of the study that are not done; ARGS='--only figure1 --seeds 1-3'
+	$(RUN) sota-implementations/study/run.py $(ARGS)
+
+report: install ## write docs/study.md from committed results; RUNS=runs/study takes runs in first
+	$(if $(RUNS),$(RUN) sota-implementations/study/collect.py $(RUNS))
+	$(RUN) sota-implementations/study/report.py
+
 test: install ## run every test that takes less than some ten seconds
 	$(RUN) -m pytest -n auto -q
 
@@ -52,5 +59,9 @@ format: install ## mend style and formatting
 types: install ## check types
 	$(RUN) -m pyright
 
+docs: install ## build the documentation, without a warning, into docs/_build/html
+	$(RUN) -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo "Open docs/_build/html/index.html"
+
 clean: ## remove the environment and everything that was generated
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis runs outputs multirun
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis docs/_build runs outputs multirun

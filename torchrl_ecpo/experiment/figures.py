@@ -3,19 +3,36 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
-__all__ = ["plot_comparison", "plot_learning_curve", "smooth"]
+__all__ = [
+    "plot_comparison",
+    "plot_comparisons",
+    "plot_heat_map",
+    "plot_learning_curve",
+    "smooth",
+]
 
-# Okabe and Ito's palette, told apart by colour-blind readers too. A method of the paper's Figure 1
-# has its colour there in every picture.
-METHOD_COLOURS = {"ecpo": "#0072B2", "urex": "#009E73", "ment": "#D55E00"}
-COLOURS = ("#CC79A7", "#E69F00", "#56B4E9", "#000000", *METHOD_COLOURS.values())
+# Okabe and Ito's palette, told apart by colour-blind readers too. A method of the paper's figures
+# has its colour in every picture.
+METHOD_COLOURS = {
+    "ecpo": "#0072B2",
+    "urex": "#009E73",
+    "ment": "#D55E00",
+    "ecac": "#0072B2",
+    "sac": "#009E73",
+    "td3": "#D55E00",
+    "ddpg": "#CC79A7",
+}
+COLOURS = ("#CC79A7", "#E69F00", "#56B4E9", "#000000", "#0072B2", "#009E73", "#D55E00")
+Curves = Mapping[str, tuple[np.ndarray, np.ndarray]]
 
 
 def smooth(values: np.ndarray, fraction: float = 0.02) -> np.ndarray:
@@ -61,7 +78,7 @@ def plot_learning_curve(
 
 
 def plot_comparison(
-    curves: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    curves: Curves,
     path: Path,
     *,
     title: str,
@@ -79,20 +96,118 @@ def plot_comparison(
     """
     figure = Figure(figsize=(6.4, 4.0), layout="constrained")
     panel = figure.subplots()
-    others = itertools.cycle(COLOURS)
-    for method, (steps, values) in curves.items():
-        colour = METHOD_COLOURS.get(method) or next(others)
-        runs = len(values)
-        mean = np.nanmean(values, axis=0)
-        panel.plot(steps, mean, color=colour, label=f"{method} ({runs} runs)")
-        if runs > 1:
-            error = np.nanstd(values, axis=0, ddof=1) / np.sqrt(runs)
-            panel.fill_between(steps, mean - error, mean + error, color=colour, alpha=0.2, lw=0)
+    labels = {method: f"{method} ({len(values)} runs)" for method, (_, values) in curves.items()}
+    _draw_curves(panel, curves, _colours(curves), labels)
     panel.set_title(title)
     panel.set_ylabel(y_label)
-    panel.legend(frameon=False)
     _decorate(panel, x_label)
-    figure.savefig(path, dpi=150)
+    return _save(figure, path)
+
+
+def plot_comparisons(
+    panels: Mapping[str, Curves],
+    path: Path,
+    *,
+    labels: Mapping[str, Mapping[str, str]],
+    methods: Sequence[str],
+    x_label: str,
+    y_label: str,
+) -> Path:
+    """Draw a panel like :func:`plot_comparison` for each of several tasks; return ``path``.
+
+    Args:
+        panels: by title, the curves of a task.
+        path: of the picture; its ending is its format.
+        labels: by title and method, what the legend says.
+        methods: all that are compared, so that each has its colour in every panel.
+        x_label: what a step is.
+        y_label: what a value is.
+    """
+    columns = min(len(panels), 3)
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(4.0 * columns, 3.2 * rows), layout="constrained")
+    axes = np.atleast_1d(figure.subplots(rows, columns)).flatten()
+    for panel, (title, curves) in zip(axes, panels.items(), strict=False):
+        _draw_curves(panel, curves, _colours(methods), labels[title], fontsize="small")
+        panel.set_title(title)
+        panel.xaxis.set_major_formatter(EngFormatter(sep=""))
+        _decorate(panel, x_label)
+    for panel in axes[::columns]:
+        panel.set_ylabel(y_label)
+    for panel in axes[len(panels) :]:
+        panel.set_visible(False)
+    return _save(figure, path)
+
+
+def plot_heat_map(
+    values: np.ndarray,
+    path: Path,
+    *,
+    title: str,
+    x_axis: tuple[str, Sequence[str]],
+    y_axis: tuple[str, Sequence[str]],
+    texts: np.ndarray,
+) -> Path:
+    """Draw a number for each pair of settings; return ``path``.
+
+    Args:
+        values: ``[y, x]``; NaN where there is none.
+        path: of the picture; its ending is its format.
+        title: of the picture.
+        x_axis: name and settings of the columns.
+        y_axis: name and settings of the rows.
+        texts: ``[y, x]``, what is written in each field.
+    """
+    figure = Figure(figsize=(1.6 + 1.1 * len(x_axis[1]), 1.4 + 0.8 * len(y_axis[1])))
+    figure.set_layout_engine("constrained")
+    panel = figure.subplots()
+    image = panel.imshow(values, origin="lower", aspect="auto", cmap="viridis")
+    panel.set_xticks(range(len(x_axis[1])), x_axis[1])
+    panel.set_yticks(range(len(y_axis[1])), y_axis[1])
+    panel.set(xlabel=x_axis[0], ylabel=y_axis[0], title=title)
+    brightest_with_white = np.nanmin(values) + 0.6 * np.ptp(values[np.isfinite(values)])
+    for (row, column), value in np.ndenumerate(values):
+        panel.text(
+            column,
+            row,
+            str(texts[row, column]),
+            ha="center",
+            va="center",
+            # On the bright end of the scale, and on the white of what is missing.
+            color="white" if value < brightest_with_white else "black",
+        )
+    figure.colorbar(image, ax=panel)
+    return _save(figure, path)
+
+
+def _colours(methods: Collection[str]) -> dict[str, str]:
+    """A colour for each method: its own, or else the next that is free, as long as there are."""
+    taken = {METHOD_COLOURS.get(method.lower()) for method in methods}
+    others = itertools.cycle([c for c in COLOURS if c not in taken] or COLOURS)
+    return {method: METHOD_COLOURS.get(method.lower()) or next(others) for method in methods}
+
+
+def _draw_curves(
+    panel: Axes,
+    curves: Curves,
+    colours: Mapping[str, str],
+    labels: Mapping[str, str],
+    fontsize: str = "medium",
+) -> None:
+    for method, (steps, values) in curves.items():
+        mean, runs = np.nanmean(values, axis=0), len(values)
+        panel.plot(steps, mean, color=colours[method], label=labels[method])
+        if runs > 1:
+            error = np.nanstd(values, axis=0, ddof=1) / np.sqrt(runs)
+            low, high = mean - error, mean + error
+            panel.fill_between(steps, low, high, color=colours[method], alpha=0.2, lw=0)
+    panel.legend(frameon=False, fontsize=fontsize)
+
+
+def _save(figure: Figure, path: Path) -> Path:
+    """Write a picture that depends on what it shows alone: no date, no random names."""
+    with matplotlib.rc_context({"svg.hashsalt": "torchrl_ecpo"}):
+        figure.savefig(path, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
     return path
 
 

@@ -1,0 +1,412 @@
+"""What is to be run: a manifest, checked, and expanded into cells of a method on a task."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import itertools
+import re
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from torchrl_ecpo.experiment.run import flatten
+
+HERE = Path(__file__).resolve().parent
+SCRIPTS = HERE.parent
+MANIFESTS = [HERE / "study.yaml", HERE / "search.yaml"]
+KINDS = ("curves", "heat_map", "ranking")
+# Runs that differ in these alone have the same numbers, as far as both go: the entries of env are
+# those that other entries are read from.
+NOT_THE_RUN = (
+    *("resume", "checkpoint", "logger", "threads"),
+    *("env.settings", "env.optim", "env.cracked", "env.evaluation_interval"),
+)
+
+Entry = TypeVar("Entry")
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is solved, by which script, and how a run on it is judged."""
+
+    name: str
+    script: str
+    """Below ``sota-implementations``."""
+    steps: int
+    metric: str
+    options: str = ""
+    """Of the script; by default ``env=`` and the task's name."""
+    title: str = ""
+    solved: float | None = None
+    """Value of the metric at which the task counts as solved."""
+    best: float | None = None
+    """The metric of a perfect policy, by which scores of several tasks are made comparable."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """Methods on tasks, compared in one figure and one table."""
+
+    name: str
+    title: str
+    tasks: tuple[str, ...]
+    methods: Mapping[str, str | Mapping[str, Any]]
+    """Options of the script; or these and a ``grid`` of values of further options."""
+    seeds: tuple[int, ...]
+    about: str = ""
+    kind: str = "curves"
+    steps: int | None = None
+    """Instead of the task's."""
+    also: tuple[str, ...] = ()
+    """Further metrics, each drawn in a figure of its own."""
+    scale_by: str | None = None
+    """Scores of several tasks are in units of this method's mean."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Runs that differ in nothing but the seed."""
+
+    study: str
+    task: Task
+    method: str
+    setting: tuple[tuple[str, str], ...]
+    """Place in the method's grid: value by axis."""
+    options: tuple[str, ...]
+    seeds: tuple[int, ...]
+    steps: int
+
+    @property
+    def label(self) -> str:
+        """The setting in words; empty without a grid."""
+        return ", ".join(f"{axis} {value}" for axis, value in self.setting)
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+        return "/".join(filter(None, (self.task.name, self.method, self.label)))
+
+    @property
+    def script(self) -> Path:
+        """The script that makes a run."""
+        return SCRIPTS / self.task.script
+
+    @property
+    def config(self) -> DictConfig:
+        """The script's configuration, but for the seed."""
+        return _compose(self.script, self.options)
+
+    @property
+    def total_option(self) -> str:
+        """The option that says how long a run is: ``total_frames`` or ``total_trajectories``."""
+        return total_option(self.config)
+
+    def identity(self, seed: int) -> dict[str, float | str]:
+        """All that determines the numbers of a run."""
+        config = self.config.copy()
+        config.seed = seed
+        return identity(config)
+
+    def directory(self, runs: Path, seed: int) -> Path:
+        """Where the queue makes a run: cells of several studies share those that are the same."""
+        slug = re.sub(r"[^\w.,+~-]+", "-", ",".join(self.options))
+        return runs / self.task.name / slug / f"seed_{seed}"
+
+
+@cache
+def _compose(script: Path, options: tuple[str, ...]) -> DictConfig:
+    try:
+        with initialize_config_dir(str(script.parent / "config"), version_base="1.3"):
+            config = compose("config", list(options))
+            OmegaConf.resolve(config.copy())
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ValueError(f"{script.name} {' '.join(options)} cannot be run: {error}") from error
+    return config
+
+
+def total_option(config: DictConfig) -> str:
+    """The option that says how long a run is; its unit follows ``total_``."""
+    return next(str(name) for name in config if str(name).startswith("total_"))
+
+
+def identity(config: DictConfig) -> dict[str, float | str]:
+    """The entries of a configuration that determine the numbers of a run, but for its length."""
+    values = flatten(OmegaConf.to_container(config, resolve=True))
+    return {
+        name: value
+        for name, value in values.items()
+        if not _is_below(name, NOT_THE_RUN) and not name.split(".")[-1].startswith("total_")
+    }
+
+
+def differences(
+    old: Mapping[str, object], new: Mapping[str, object], ignored: Sequence[str] = ()
+) -> list[str]:
+    """What differs between two runs, in words; but for entries that are ignored.
+
+    Examples:
+        >>> differences({"tau": 0.5, "a.b": 1}, {"tau": 0.1}, ignored=["a"])
+        ['tau was 0.5, is 0.1']
+    """
+    return [
+        f"{name} was {old.get(name, 'absent')}, is {new.get(name, 'absent')}"
+        for name in sorted(old.keys() | new.keys())
+        if name not in old or name not in new or old[name] != new[name]
+        if not _is_below(name, ignored)
+    ]
+
+
+def _is_below(name: str, entries: Iterable[str]) -> bool:
+    return any(f"{name}.".startswith(f"{entry}.") for entry in entries)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Curves that ``torchrl_ecpo.experiment.compare`` wrote, of runs that no queue made."""
+
+    name: str
+    title: str
+    files: Mapping[str, str]
+    """By task, below ``results``."""
+    about: str = ""
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What one or several files say, by name."""
+
+    tasks: dict[str, Task] = dataclasses.field(default_factory=dict)
+    studies: dict[str, Study] = dataclasses.field(default_factory=dict)
+    recorded: dict[str, Recorded] = dataclasses.field(default_factory=dict)
+
+    def cells(self, study: Study) -> list[Cell]:
+        """All cells of a study, task by task."""
+        return [
+            Cell(
+                study=study.name,
+                task=task,
+                method=method,
+                setting=setting,
+                options=(*shlex.split(task.options or f"env={task.name}"), *options),
+                seeds=study.seeds,
+                steps=study.steps or task.steps,
+            )
+            for task in (self.tasks[name] for name in study.tasks)
+            for method, plan in study.methods.items()
+            for setting, options in _settings(plan)
+        ]
+
+    def select(
+        self,
+        only: Sequence[str] = (),
+        tasks: Sequence[str] = (),
+        methods: Sequence[str] = (),
+        seeds: Iterable[int] = (),
+    ) -> list[Cell]:
+        """The cells of some studies, tasks, methods and seeds; of all, where none is named.
+
+        Raises:
+            ValueError: for a name that the manifest does not have, and if nothing is left.
+        """
+        cells = [cell for study in self.studies.values() for cell in self.cells(study)]
+        _check_names("--only", only, self.studies)
+        _check_names("--tasks", tasks, {cell.task.name for cell in cells})
+        _check_names("--methods", methods, {cell.method for cell in cells})
+        wanted = set(seeds)
+        selected = [
+            dataclasses.replace(
+                cell, seeds=tuple(seed for seed in cell.seeds if not wanted or seed in wanted)
+            )
+            for cell in cells
+            if (not only or cell.study in only)
+            and (not tasks or cell.task.name in tasks)
+            and (not methods or cell.method in methods)
+        ]
+        if not any(cell.seeds for cell in selected):
+            raise ValueError("No run is left by this choice of names and seeds.")
+        return selected
+
+
+def _settings(
+    plan: str | Mapping[str, Any],
+) -> list[tuple[tuple[tuple[str, str], ...], tuple[str, ...]]]:
+    """The settings of a method, and the options of each."""
+    if isinstance(plan, str):
+        return [((), tuple(shlex.split(plan)))]
+    axes = [
+        [
+            (str(axis), str(value), shlex.split(options[value]) if named else [f"{axis}={value}"])
+            for value in options
+        ]
+        for axis, options in plan["grid"].items()
+        for named in [isinstance(options, Mapping)]
+    ]
+    return [
+        (
+            tuple((axis, value) for axis, value, _ in point),
+            (*shlex.split(plan["options"]), *(o for *_, options in point for o in options)),
+        )
+        for point in itertools.product(*axes)
+    ]
+
+
+def parse_seeds(given: str | int | Sequence[int]) -> tuple[int, ...]:
+    """Seeds from ``"1-3,7"``, a number or a list of numbers.
+
+    Raises:
+        ValueError: for anything else.
+
+    Examples:
+        >>> parse_seeds("1-3,7")
+        (1, 2, 3, 7)
+    """
+    parts = given if isinstance(given, Sequence) else [given]
+    parts = given.split(",") if isinstance(given, str) else parts
+    seeds: list[int] = []
+    for part in map(str, parts):
+        bounds = re.fullmatch(r"\s*(\d+)(?:-(\d+))?\s*", part)
+        if bounds is None:
+            raise ValueError(f"Seeds are written like 1-3,7 or [1, 2, 3, 7], got {given!r}.")
+        first, last = int(bounds[1]), int(bounds[2] or bounds[1])
+        seeds += range(first, last + 1)
+    if not seeds or len(set(seeds)) < len(seeds):
+        raise ValueError(f"Seeds must be there, and none twice, got {given!r}.")
+    return tuple(seeds)
+
+
+def read_manifests(paths: Sequence[Path] = MANIFESTS) -> Manifest:
+    """Read and check manifests; studies may name the tasks of files before theirs.
+
+    Raises:
+        ValueError: if a file is no manifest; the message names the entry.
+    """
+    manifest = Manifest()
+    sections = {field.name for field in dataclasses.fields(Manifest)}
+    for path in paths:
+        content = yaml.safe_load(path.read_text())
+        if not isinstance(content, Mapping) or not set(content) <= sections:
+            raise ValueError(f"{path} must be a mapping with {sorted(sections)} and nothing else.")
+        for name, entry in content.get("tasks", {}).items():
+            _add(manifest.tasks, path, _read_task(f"{path}, task {name}", name, entry))
+        for name, entry in content.get("studies", {}).items():
+            study = _read_study(f"{path}, study {name}", name, entry, manifest.tasks)
+            _add(manifest.studies, path, study)
+        for name, entry in content.get("recorded", {}).items():
+            where = f"{path}, recorded {name}"
+            recorded = _read(Recorded, where, name, entry)
+            _check_names(f"{where}, files", recorded.files, manifest.tasks)
+            _add(manifest.recorded, path, recorded)
+    return manifest
+
+
+def _add(known: dict[str, Any], path: Path, entry: Any) -> None:
+    if entry.name in known:
+        raise ValueError(f"{path}: {entry.name} is there twice.")
+    known[entry.name] = entry
+
+
+def _read_task(where: str, name: str, entry: object) -> Task:
+    task = _read(Task, where, name, entry)
+    _check_steps(where, task.steps)
+    if not (SCRIPTS / task.script).is_file():
+        raise ValueError(f"{where}: there is no script {task.script} in {SCRIPTS.name}.")
+    return task
+
+
+def _read_study(where: str, name: str, entry: object, tasks: Mapping[str, Task]) -> Study:
+    study = _read(Study, where, name, entry)
+    try:
+        study = dataclasses.replace(
+            study,
+            seeds=parse_seeds(study.seeds),
+            tasks=tuple(study.tasks),
+            also=tuple(study.also),
+        )
+        _check_names("tasks", study.tasks, tasks)
+        _check_names("scale_by", [study.scale_by] if study.scale_by else [], study.methods)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+    if study.kind not in KINDS:
+        raise ValueError(f"{where}: kind must be one of {KINDS}, got {study.kind!r}.")
+    if study.steps is not None:
+        _check_steps(where, study.steps)
+    for method, plan in study.methods.items():
+        if not isinstance(plan, str) and set(plan) != {"options", "grid"}:
+            raise ValueError(
+                f"{where}: method {method} must be options of the script, or a mapping with "
+                f"options and grid, got {plan!r}."
+            )
+        if study.kind == "heat_map" and (isinstance(plan, str) or len(plan["grid"]) != 2):
+            raise ValueError(f"{where}: a heat map needs a grid of two axes, method {method}.")
+    return study
+
+
+def _read(kind: type[Entry], where: str, name: str, entry: object) -> Entry:
+    fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    del fields["name"]
+    if not isinstance(entry, Mapping):
+        raise ValueError(f"{where} must be a mapping with {sorted(fields)}, got {entry!r}.")
+    unknown = set(entry) - set(fields)
+    required = {key for key, field in fields.items() if field.default is dataclasses.MISSING}
+    if unknown:
+        raise ValueError(f"{where}: unknown {sorted(unknown)}; there are {sorted(fields)}.")
+    if required - set(entry):
+        raise ValueError(f"{where}: {sorted(required - set(entry))} must be given.")
+    return kind(**{"name": name, **entry})
+
+
+def _check_steps(where: str, steps: object) -> None:
+    if not isinstance(steps, int) or steps < 1:
+        raise ValueError(f"{where}: steps must be an integer of at least 1, got {steps!r}.")
+
+
+def _check_names(option: str, given: Iterable[str], known: Iterable[str]) -> None:
+    unknown = [name for name in given if name not in set(known)]
+    if unknown:
+        raise ValueError(f"{option}: unknown {unknown}; there are {sorted(known)}.")
+
+
+def argument_parser(description: str | None) -> argparse.ArgumentParser:
+    """A parser of what queue, collection and report have in common."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--manifest", type=Path, nargs="+", default=MANIFESTS)
+    parser.add_argument("--only", type=_names, default=[], help="studies: figure1,figure2")
+    return parser
+
+
+def add_ignored(parser: argparse.ArgumentParser) -> None:
+    """Let a user take runs whose configuration lacks what has been added since."""
+    parser.add_argument(
+        "--ignore",
+        type=_names,
+        default=[],
+        help="entries of a configuration that make no difference: collector,loss.options.new",
+    )
+
+
+def _names(given: str) -> list[str]:
+    return [name.strip() for name in given.split(",")]
+
+
+def _seeds(given: str) -> tuple[int, ...]:
+    try:
+        return parse_seeds(given)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def add_selection(parser: argparse.ArgumentParser) -> None:
+    """Let a user choose among the runs of a study, too."""
+    parser.add_argument("--tasks", type=_names, default=[], help="copy,reverse")
+    parser.add_argument("--methods", type=_names, default=[], help="ECPO,UREX")
+    parser.add_argument("--seeds", type=_seeds, default=(), help="1-3,7")

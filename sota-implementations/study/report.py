@@ -1,0 +1,468 @@
+"""Turn committed results into the figures and tables of ``docs/study.md``.
+
+``python report.py``; takes no run and no network, and writes the same files from the same results.
+"""
+
+from __future__ import annotations
+
+import csv
+import statistics
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+from manifest import SCRIPTS, Cell, Manifest, Recorded, Study, argument_parser, read_manifests
+from results import RESULTS, Point, Results
+from scores import (
+    Estimate,
+    area,
+    final,
+    interquartile_means,
+    probabilities_of_improvement,
+    steps_to_solve,
+)
+
+from torchrl_ecpo.experiment.figures import plot_comparisons, plot_heat_map
+
+DOCS = SCRIPTS.parent / "docs"
+BEST = 3  # settings of a search that are listed
+FORMATS = (".svg", ".png")
+# Metrics as figures name them.
+METRIC_LABELS = {
+    "expected_reward": "expected reward",
+    "evaluation_return": "return",
+    "ESS": "effective sample size",
+}
+SCORES = ("runs", "area", "final", "solved", "steps to solve")
+INTRODUCTION = """# The study
+
+<!-- Written by make report from sota-implementations/results: change what it is made from. -->
+
+Every run, figure and table here follows from
+[`study.yaml`](../sota-implementations/study/study.yaml), and every search of settings from
+[`search.yaml`](../sota-implementations/study/search.yaml). What it all means is said in
+[the results](results.md).
+
+```bash
+make study                                      # the runs; goes on where it was stopped
+make study ARGS='--only figure1 --seeds 1-10'   # some of them
+make report RUNS=runs/study                     # take their results in, and write this page
+make report                                     # write it from the committed results
+```
+
+How to read the tables:
+
+- **runs**: those that made all steps. "3 of 25 planned": the others have not, or not to the end.
+- **area**: under the learning curve, over its length: the mean of the metric over the whole run.
+- **final**: mean of the metric over the last tenth of the run. Both with standard error over runs.
+- **solved**: share of runs that reached the threshold, on average over a hundredth of the run.
+- **steps to solve**: median over all runs; "> 240,000" if half of the runs or more never did.
+- Figures show the mean over runs and its standard error; the legend has the number of runs.
+- Intervals are 95 % intervals of a stratified bootstrap, by
+  [rliable](https://github.com/google-research/rliable). The interquartile mean (IQM) is the mean of
+  the middle half of all runs on all tasks; the probability of improvement is that of a run of one
+  method ending above a run of another, mean over tasks.
+"""
+
+Curve = tuple[np.ndarray, np.ndarray]
+"""Steps ``[n]`` and values ``[runs, n]``."""
+
+
+@dataclass(frozen=True)
+class CellResult:
+    """What is known of a cell."""
+
+    cell: Cell
+    runs: dict[int, dict[str, str]]
+    """By seed, of those planned: the runs that made all steps."""
+    unfinished: int
+    """Runs that did not."""
+    curves: dict[int, list[Point]]
+
+    @property
+    def title(self) -> str:
+        """Of the task."""
+        return self.cell.task.title or self.cell.task.name
+
+    @property
+    def count(self) -> str:
+        """Runs that there are; of how many, if there should be more."""
+        planned = len(self.cell.seeds)
+        return (
+            f"{len(self.runs)}" if len(self.runs) == planned else f"{len(self.runs)} of {planned}"
+        )
+
+    def curve(self, metric: str) -> Curve | None:
+        """None if no run has the metric."""
+        points = [
+            [(point["step"], point[metric]) for point in self.curves[seed] if metric in point]
+            for seed in sorted(self.runs)
+        ]
+        return align([np.array(pairs) for pairs in points if pairs])
+
+    @cached_property
+    def scored(self) -> Curve | None:
+        """The task's own metric."""
+        return self.curve(self.cell.task.metric)
+
+    @cached_property
+    def finals(self) -> np.ndarray:
+        """The final score of each run, ``[runs]``."""
+        return np.empty(0) if self.scored is None else final(*self.scored)
+
+
+def align(curves: Sequence[np.ndarray]) -> Curve | None:
+    """Runs on common steps, where one that was measured at others keeps its latest value.
+
+    Args:
+        curves: of each run ``[n, 2]``, steps and values; n may differ.
+    """
+    if not curves:
+        return None
+    steps = np.unique(np.concatenate([curve[:, 0] for curve in curves]))
+    steps = steps[steps >= max(curve[0, 0] for curve in curves)]
+    values = [c[np.searchsorted(c[:, 0], steps, side="right") - 1, 1] for c in curves]
+    return steps, np.stack(values)
+
+
+def read_cell(cell: Cell, results: Results) -> CellResult:
+    """The results of a cell; a run with other options than the cell's now is none of it."""
+    options, complete, unfinished = " ".join(cell.options), {}, 0
+    curves = {}
+    for seed in cell.seeds:
+        key = (cell.task.name, cell.method, cell.label, seed)
+        run = results.runs.get(key)
+        if run is None or run["options"] != options:
+            continue
+        if int(run["reached"]) < cell.steps:
+            unfinished += 1
+            continue
+        complete[seed] = run
+        curves[seed] = [point for point in results.curves[key] if point["step"] <= cell.steps]
+    return CellResult(cell, complete, unfinished, curves)
+
+
+# ------------------------------------------------------------------------------------------ tables
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table in markdown."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+
+
+def with_error(values: np.ndarray) -> str:
+    """Mean and standard error, with as many digits as the size of the mean asks for.
+
+    Examples:
+        >>> with_error(np.array([10.0, 14.0]))
+        '12.0 ± 2.0'
+    """
+    mean = values.mean()
+    digits = 3 if abs(mean) < 2 else 1 if abs(mean) < 200 else 0
+    error = f" ± {values.std(ddof=1) / len(values) ** 0.5:,.{digits}f}" if len(values) > 1 else ""
+    return f"{mean:,.{digits}f}{error}"
+
+
+def in_ranges(seeds: Iterable[int]) -> str:
+    """Seeds as they are written in a manifest.
+
+    Examples:
+        >>> in_ranges([1, 2, 3, 7])
+        '1-3, 7'
+    """
+    ranges: list[list[int]] = []
+    for seed in sorted(seeds):
+        if ranges and ranges[-1][-1] == seed - 1:
+            ranges[-1].append(seed)
+        else:
+            ranges.append([seed])
+    return ", ".join(f"{r[0]}-{r[-1]}" if len(r) > 1 else str(r[0]) for r in ranges)
+
+
+def runs_table(cells: Sequence[CellResult]) -> str:
+    """Steps, seeds and time of every cell."""
+    rows = []
+    for result in cells:
+        cell, count = result.cell, result.count
+        seconds = [float(run["seconds"]) for run in result.runs.values() if run["seconds"]]
+        is_complete = len(result.runs) == len(cell.seeds)
+        unfinished = f"; {result.unfinished} unfinished" if result.unfinished else ""
+        rows.append(
+            [
+                result.title,
+                ", ".join(filter(None, (cell.method, cell.label))),
+                f"`{' '.join(cell.options)}`",
+                f"{cell.steps:,}",
+                (count if is_complete else f"**{count} planned**") + unfinished,
+                in_ranges(result.runs),
+                f"{statistics.median(seconds) / 60:.1f}" if seconds else "",
+            ]
+        )
+    header = ("task", "method", "options", "steps", "runs", "seeds", "minutes a run (median)")
+    return table(header, rows)
+
+
+def search_table(cells: Sequence[CellResult]) -> str:
+    """Settings, steps and seeds of every method on every task."""
+    rows = []
+    for group in groups_of(cells):
+        cell = group[0].cell
+        made = sum(len(result.runs) for result in group)
+        planned = len(group) * len(cell.seeds)
+        runs = f"{made}" if made == planned else f"**{made} of {planned} planned**"
+        seeds = in_ranges({seed for result in group for seed in result.runs})
+        rows.append([group[0].title, cell.method, len(group), f"{cell.steps:,}", runs, seeds])
+    return table(("task", "method", "settings", "steps", "runs", "seeds"), rows)
+
+
+def scores_table(cells: Sequence[CellResult]) -> str:
+    """Scores of every cell that has runs."""
+    rows = [
+        [r.title, r.cell.method, *scores(r.count, r.scored, r.cell.task.solved)]
+        for r in cells
+        if r.scored is not None
+    ]
+    has_thresholds = any(r.cell.task.solved is not None for r in cells)
+    width = 2 + len(SCORES) if has_thresholds else 2 + SCORES.index("solved")
+    return table(("task", "method", *SCORES)[:width], [row[:width] for row in rows])
+
+
+def scores(count: str, curve: Curve, threshold: float | None) -> list[str]:
+    """What the columns `SCORES` say of some runs."""
+    cells = [count, with_error(area(*curve)), with_error(final(*curve))]
+    if threshold is None:
+        return [*cells, "", ""]
+    needed = steps_to_solve(*curve, threshold)
+    # The upper one of the middle two, which may be infinite.
+    median = np.sort(needed)[len(needed) // 2]
+    is_finite = np.isfinite(median)
+    text = f"{median:,.0f}" if is_finite else f"> {curve[0][-1]:,.0f}"
+    return [*cells, f"{np.isfinite(needed).mean():.0%}", text]
+
+
+def aggregates(study: Study, cells: Sequence[CellResult]) -> str:
+    """Interquartile means and probabilities of improvement; empty if they make no sense yet."""
+    finals = {(r.cell.task.name, r.cell.method): r.finals for r in cells}
+    tasks = {
+        r.cell.task.name: r
+        for r in cells
+        if all(len(finals[r.cell.task.name, method]) > 1 for method in study.methods)
+    }
+    if not tasks or len(study.methods) < 2:
+        return ""
+    units = {
+        name: float(finals[name, study.scale_by].mean()) if study.scale_by else r.cell.task.best
+        for name, r in tasks.items()
+    }
+    if None in units.values():
+        return ""
+    by_method = {}
+    for method in study.methods:
+        # As many runs of a method on each task as where it has fewest, the first seeds.
+        count = min(len(finals[name, method]) for name in tasks)
+        columns = [finals[name, method][:count] / unit for name, unit in units.items()]
+        by_method[method] = np.stack(columns, axis=1)
+    means, first = interquartile_means(by_method), next(iter(study.methods))
+    better = probabilities_of_improvement(by_method, first)
+    rows = [
+        (m, len(by_method[m]), _interval(means[m]), _interval(better[m]) if m in better else "")
+        for m in study.methods
+    ]
+    unit = f"the mean of {study.scale_by}" if study.scale_by else "the score of a perfect policy"
+    titles = ", ".join(r.title for r in tasks.values())
+    return f"Final scores over {titles}, each in units of {unit}:\n\n" + table(
+        ("method", "runs a task", "IQM", f"probability that {first} is better"), rows
+    )
+
+
+def _interval(estimate: Estimate) -> str:
+    return f"{estimate.value:.2f} ({estimate.low:.2f} to {estimate.high:.2f})"
+
+
+def ranking(cells: Sequence[CellResult]) -> str:
+    """The best settings of each method on each task."""
+    rows = []
+    for group in groups_of(cells):
+        have_runs = [result for result in group if len(result.finals)]
+        best = sorted(have_runs, key=lambda result: -result.finals.mean())[:BEST]
+        listed = [f"{r.cell.label}: {with_error(r.finals)} ({r.count} runs)" for r in best]
+        listed += [""] * (BEST - len(best))
+        searched = f"{len(have_runs)} of {len(group)}"
+        rows.append([group[0].title, group[0].cell.method, searched, *listed])
+    return table(("task", "method", "settings run", "best", "second", "third"), rows)
+
+
+def groups_of(cells: Iterable[CellResult]) -> list[list[CellResult]]:
+    """The settings of each method on each task."""
+    groups: dict[tuple[str, str], list[CellResult]] = {}
+    for result in cells:
+        groups.setdefault((result.cell.task.name, result.cell.method), []).append(result)
+    return list(groups.values())
+
+
+# ----------------------------------------------------------------------------------------- figures
+
+
+def draw(name: str, docs: Path, picture: Callable[[Path], object], text: str) -> str:
+    """Draw a picture in each format; return the markdown that shows it."""
+    folder = docs / "figures" / "study"
+    folder.mkdir(parents=True, exist_ok=True)
+    for ending in FORMATS:
+        picture(folder / f"{name}{ending}")
+    return f"![{text}](figures/study/{name}.svg)"
+
+
+def curves_figure(
+    study: Study, cells: Sequence[CellResult], docs: Path, metric: str | None = None
+) -> str:
+    """A panel for each task that has runs; of the task's own metric if none is named."""
+    panels: dict[str, dict[str, Curve]] = {}
+    labels: dict[str, dict[str, str]] = {}
+    for result in cells:
+        curve = result.curve(metric) if metric else result.scored
+        if curve is not None:
+            panels.setdefault(result.title, {})[result.cell.method] = curve
+            label = f"{result.cell.method} ({result.count})"
+            labels.setdefault(result.title, {})[result.cell.method] = label
+    if not panels:
+        return ""
+    shown = [result for result in cells if result.title in panels]
+    metrics = dict.fromkeys(metric or result.cell.task.metric for result in shown)
+    y_label = " or ".join(METRIC_LABELS.get(name, name) for name in metrics)
+    picture = partial(
+        plot_comparisons,
+        panels,
+        labels=labels,
+        methods=list(study.methods),
+        x_label=next(run["unit"] for result in shown for run in result.runs.values()),
+        y_label=y_label,
+    )
+    name = f"{study.name}_{metric}" if metric else study.name
+    return draw(name, docs, picture, f"{study.title}: {y_label}")
+
+
+def heat_maps(study: Study, cells: Sequence[CellResult], docs: Path) -> str:
+    """Final scores over the grid of each method on each task."""
+    return "\n\n".join(
+        heat_map(study, group, docs)
+        for group in groups_of(cells)
+        if any(result.runs for result in group)
+    )
+
+
+def heat_map(study: Study, group: Sequence[CellResult], docs: Path) -> str:
+    """Final scores over a grid."""
+    task, method = group[0].cell.task, group[0].cell.method
+    axes = [
+        (axis, list(dict.fromkeys(result.cell.setting[place][1] for result in group)))
+        for place, (axis, _) in enumerate(group[0].cell.setting)
+    ]
+    shape = tuple(len(values) for _, values in axes)
+    means = [result.finals.mean() if result.runs else np.nan for result in group]
+    texts = [
+        f"{mean:.1f}\n({result.count})" if result.runs else "not run"
+        for mean, result in zip(means, group, strict=True)
+    ]
+    label = METRIC_LABELS.get(task.metric, task.metric)
+    picture = partial(
+        plot_heat_map,
+        np.reshape(means, shape),
+        title=f"{method} on {group[0].title}: final {label} (runs)",
+        y_axis=axes[0],
+        x_axis=axes[1],
+        texts=np.reshape(texts, shape),
+    )
+    name = f"{study.name}_{task.name}_{method.lower()}"
+    return draw(name, docs, picture, f"{study.title}, {group[0].title}: final {label}")
+
+
+# -------------------------------------------------------------------------------------------- page
+
+
+def section(study: Study, cells: Sequence[CellResult], docs: Path) -> str:
+    """All that is said of a study."""
+    runs = runs_table(cells)
+    if study.kind == "curves":
+        parts = [
+            curves_figure(study, cells, docs),
+            scores_table(cells),
+            aggregates(study, cells),
+            *(curves_figure(study, cells, docs, metric) for metric in study.also),
+        ]
+    elif study.kind == "heat_map":
+        parts = [heat_maps(study, cells, docs)]
+    else:
+        parts, runs = [ranking(cells)], search_table(cells)
+    source = (
+        f"The runs, by `make study ARGS='--only {study.name}'`; each with its time and versions, "
+        "the curves and the whole configuration of each cell are in "
+        f"[`results/study/{study.name}`](../sota-implementations/results/study/{study.name}):"
+    )
+    return "\n\n".join(filter(None, [f"## {study.title}", study.about, *parts, source, runs]))
+
+
+def recorded_section(recorded: Recorded, manifest: Manifest, results: Path) -> str:
+    """Scores of curves that are there already."""
+    rows = []
+    for name, file in recorded.files.items():
+        task = manifest.tasks[name]
+        with (results / file).open(newline="") as lines:
+            points = list(csv.DictReader(lines))
+        for method in dict.fromkeys(point["method"] for point in points):
+            runs: dict[str, list[tuple[float, float]]] = {}
+            for point in points:
+                if point["method"] == method:
+                    pair = (float(point["step"]), float(point[task.metric]))
+                    runs.setdefault(point["run"], []).append(pair)
+            curve = align([np.array(run) for run in runs.values()])
+            assert curve is not None
+            row = scores(str(len(runs)), curve, task.solved)
+            rows.append([task.title or name, method, f"{curve[0][-1]:,.0f}", *row])
+    text = table(("task", "method", "steps", *SCORES), rows)
+    return "\n\n".join([f"## {recorded.title}", recorded.about, text])
+
+
+def write_report(manifest: Manifest, results: Path, docs: Path, only: Sequence[str] = ()) -> Path:
+    """Write page and figures; return the page.
+
+    Args:
+        manifest: what was planned.
+        results: the folder with what was collected.
+        docs: where the page goes and, in ``figures/study``, its pictures.
+        only: studies to which the page is limited.
+    """
+    sections, waiting = [], []
+    for study in manifest.studies.values():
+        if only and study.name not in only:
+            continue
+        collected = Results.read(results / "study" / study.name)
+        cells = [read_cell(cell, collected) for cell in manifest.cells(study)]
+        if any(result.runs for result in cells):
+            sections.append(section(study, cells, docs))
+        else:
+            waiting.append(f"- {study.title} (`{study.name}`)")
+    sections += [recorded_section(r, manifest, results) for r in manifest.recorded.values()]
+    if waiting:
+        sections.append("## Without a complete run yet\n\n" + "\n".join(waiting))
+    page = docs / "study.md"
+    page.write_text("\n\n".join([INTRODUCTION.rstrip(), *sections]) + "\n")
+    return page
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write the report, and say where it is."""
+    parser = argument_parser(__doc__)
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--docs", type=Path, default=DOCS)
+    options = parser.parse_args(arguments)
+    manifest = read_manifests(options.manifest)
+    print(write_report(manifest, options.results, options.docs, options.only))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

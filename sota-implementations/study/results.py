@@ -1,0 +1,149 @@
+"""What is committed of a study: the table of its runs, their curves, each cell's configuration."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from manifest import SCRIPTS, Cell, differences
+from records import Record
+
+RESULTS = SCRIPTS / "results"
+# Of a curve: each is the mean over a hundredth of the run.
+POINTS = 100
+KEYS = ("task", "method", "setting", "seed")
+Key = tuple[str, str, str, int]
+Point = dict[str, float]
+
+
+@dataclass
+class Results:
+    """Results of a study, by task, method, setting and seed.
+
+    Three files: ``runs.csv`` has a row for each run, with options, steps, time and versions,
+    ``curves.csv`` the metrics, ``configs.json`` the whole configuration of each cell.
+    """
+
+    directory: Path
+    runs: dict[Key, dict[str, str]] = field(default_factory=dict)
+    curves: dict[Key, list[Point]] = field(default_factory=dict)
+    configs: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, directory: Path) -> Results:
+        """Read what is committed; empty if there is nothing."""
+        if not directory.is_dir():
+            return cls(directory)
+        runs = {_key(row): row for row in _read_csv(directory / "runs.csv")}
+        points = _read_csv(directory / "curves.csv")
+        curves = {
+            key: [{k: float(v) for k, v in row.items() if k not in KEYS and v} for row in rows]
+            for key, rows in itertools.groupby(points, _key)
+        }
+        return cls(directory, runs, curves, json.loads((directory / "configs.json").read_text()))
+
+    def write(self) -> None:
+        """Write the files, in an order that depends on nothing but their content."""
+        self.directory.mkdir(parents=True, exist_ok=True)
+        _write_csv(self.directory / "runs.csv", [self.runs[key] for key in sorted(self.runs)])
+        points = [
+            {**dict(zip(KEYS, key, strict=True)), **point}
+            for key in sorted(self.curves)
+            for point in self.curves[key]
+        ]
+        _write_csv(self.directory / "curves.csv", points)
+        text = json.dumps(self.configs, indent=1, sort_keys=True)
+        (self.directory / "configs.json").write_text(text + "\n")
+
+    def add(
+        self, cell: Cell, record: Record, metrics: Sequence[str], ignored: Sequence[str] = ()
+    ) -> bool:
+        """Take a run in, unless one of the cell and seed is there that went as far.
+
+        Runs of the cell that were made with another configuration are dropped, but for entries
+        that are ignored.
+        """
+        # A cell has one configuration but for the seed, after which the bandit's instance is named.
+        config = {k: value for k, value in record.identity.items() if not k.endswith("seed")}
+        changes = differences(self.configs.get(cell.name, config), config, ignored)
+        if changes:
+            print(
+                f"{self.directory.name}: results of {cell.name} are dropped, for "
+                f"{'; '.join(changes)}"
+            )
+            self._drop(cell)
+        key = (cell.task.name, cell.method, cell.label, record.seed)
+        if key in self.runs and int(self.runs[key]["reached"]) >= record.reached:
+            return False
+        self.configs[cell.name] = config
+        self.curves[key] = thin(record.metrics, metrics, cell.steps)
+        values = {
+            **dict(zip(KEYS, key, strict=True)),
+            "options": " ".join(cell.options),
+            "steps": cell.steps,
+            "reached": record.reached,
+            "unit": record.unit,
+            "finished": record.finished,
+            "seconds": record.summary.get("seconds", ""),
+            **record.versions,
+        }
+        self.runs[key] = {name: str(value) for name, value in values.items()}
+        return True
+
+    def _drop(self, cell: Cell) -> None:
+        for key in list(self.runs):
+            if key[:3] == (cell.task.name, cell.method, cell.label):
+                del self.runs[key], self.curves[key]
+
+
+def thin(columns: Mapping[str, Sequence[float]], metrics: Sequence[str], steps: int) -> list[Point]:
+    """The mean of each metric over each of `POINTS` equal parts of a run, where it was measured.
+
+    Args:
+        columns: of ``metrics.csv``.
+        metrics: to be kept, of those that are there.
+        steps: of the run; what is later is left out. A part has the number of its last step.
+
+    Examples:
+        >>> thin({"step": [1, 2, 3], "return": [0.0, 2.0, 5.0]}, ["return"], steps=200)
+        [{'step': 2, 'return': 1.0}, {'step': 4, 'return': 5.0}]
+    """
+    at = np.array(columns["step"])
+    width = steps / POINTS
+    # Rounding errors must not put the last step of a part into the next.
+    parts = np.maximum(np.ceil(at / width - 1e-9), 1)
+    parts[at > steps] = np.nan
+    points: list[Point] = []
+    for part in np.unique(parts[np.isfinite(parts)]):
+        point: Point = {"step": round(part * width)}
+        for name in metrics:
+            values = np.array(columns[name])[parts == part] if name in columns else np.empty(0)
+            values = values[np.isfinite(values)]
+            if len(values):
+                point[name] = float(f"{values.mean():.5g}")
+        if len(point) > 1:
+            points.append(point)
+    return points
+
+
+def _key(row: Mapping[str, str]) -> Key:
+    return row["task"], row["method"], row["setting"], int(row["seed"])
+
+
+def _read_csv(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def _write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
+    columns = dict.fromkeys(name for row in rows for name in row)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)

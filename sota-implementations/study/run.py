@@ -1,0 +1,257 @@
+"""Make the runs of a manifest, as many at a time as there are cores.
+
+``python run.py --only figure1 --tasks copy,reverse --seeds 1-3``. What is done is skipped. Ctrl-C
+or SIGTERM lets each run write a checkpoint; the same command goes on from there, also after a kill.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import fcntl
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+from manifest import (
+    Cell,
+    add_ignored,
+    add_selection,
+    argument_parser,
+    differences,
+    read_manifests,
+)
+from records import find_record
+
+POLL = 0.2  # seconds
+LOG_LINES = 12
+# One thread a run: fastest at these sizes, and as many runs as cores.
+ENVIRONMENT = {"OMP_NUM_THREADS": "1", "MUJOCO_GL": "disabled"}
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run that the manifest asks for."""
+
+    cell: Cell
+    seed: int
+    directory: Path
+    ignored: Sequence[str] = ()
+
+    def __str__(self) -> str:
+        """For messages."""
+        return f"{self.cell.name}/seed {self.seed}"
+
+    @property
+    def is_done(self) -> bool:
+        """Whether all steps are there; of a longer run, as many as were asked for.
+
+        Raises:
+            ValueError: if the directory holds a run of another configuration.
+        """
+        record = find_record(self.directory)
+        if record is None:
+            return False
+        changes = differences(record.identity, self.cell.identity(self.seed), self.ignored)
+        if changes:
+            raise ValueError(
+                f"{self.directory} holds a run of another configuration: {'; '.join(changes)}. "
+                "Remove it, give another directory with --runs, or, if that makes no difference, "
+                "--ignore these entries."
+            )
+        is_complete = record.finished or record.total > self.cell.steps
+        return is_complete and record.reached >= self.cell.steps
+
+    @property
+    def command(self) -> list[str]:
+        """What makes the run, or goes on with it.
+
+        A run that was to be shorter begins anew: when it finished it left out its replay buffer.
+        """
+        record = find_record(self.directory)
+        is_shorter = record is not None and record.total < self.cell.steps
+        steps = self.cell.steps if record is None else max(record.total, self.cell.steps)
+        return [
+            *(sys.executable, str(self.cell.script), *self.cell.options, f"seed={self.seed}"),
+            f"{self.cell.total_option}={steps}",
+            f"hydra.run.dir='{self.directory}'",
+            f"resume={'null' if is_shorter else 'auto'}",
+        ]
+
+
+def planned_runs(cells: Sequence[Cell], directory: Path, ignored: Sequence[str] = ()) -> list[Run]:
+    """Every run once, by seed first: a study that is stopped early has something of each cell."""
+    runs = [
+        Run(cell, seed, cell.directory(directory, seed), ignored)
+        for cell in cells
+        for seed in cell.seeds
+    ]
+    places = {seed: place for cell in cells for place, seed in enumerate(cell.seeds)}
+    unique: dict[Path, Run] = {}
+    for run in sorted(runs, key=lambda run: places[run.seed]):
+        same = unique.setdefault(run.directory, run)
+        if run.cell.steps > same.cell.steps:
+            unique[run.directory] = run
+    return list(unique.values())
+
+
+@dataclass
+class Job:
+    """A run in progress, in a process of ours or, with none, of somebody else's."""
+
+    run: Run
+    process: subprocess.Popen[bytes] | None
+    started: float = dataclasses.field(default_factory=time.monotonic)
+    signals: int = 0
+
+
+class Queue:
+    """Runs that wait, and those in progress.
+
+    A run holds a lock on a file in its directory for as long as its process lives, whatever
+    becomes of the queue. So a queue that is started again after a kill waits for the runs that
+    went on without it.
+    """
+
+    def __init__(self, runs: Sequence[Run], workers: int) -> None:
+        self.waiting, self.jobs = deque(runs), list[Job]()
+        self.total, self.workers = len(runs), workers
+        self.done = 0
+        self.failures: dict[str, str] = {}
+        self.stopped_by: signal.Signals | None = None
+        self._signals = 0
+
+    def work(self) -> None:
+        """Until all is done, or a signal has come and all runs of ours have ended."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._stop)
+        while self.waiting or self.jobs:
+            while self.waiting and len(self.jobs) < self.workers and self.stopped_by is None:
+                self._begin(self.waiting.popleft())
+            if self.stopped_by is not None and not any(job.process for job in self.jobs):
+                break
+            time.sleep(POLL)
+            for job in list(self.jobs):
+                self._follow(job)
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        self.stopped_by = signal.Signals(number)
+        self._signals += 1
+
+    def _begin(self, run: Run) -> None:
+        run.directory.mkdir(parents=True, exist_ok=True)
+        with (run.directory / "lock").open("a") as lock:
+            if not _locked(lock.fileno()):
+                print(f"waits     {run}: another process runs it", flush=True)
+                self.jobs.append(Job(run, process=None))
+                return
+            try:
+                if run.is_done:
+                    self._report("is done", run)
+                    return
+                command = run.command
+            except ValueError as error:
+                self._fail(run, str(error))
+                return
+            with (run.directory / "log.txt").open("ab") as log:
+                process = subprocess.Popen(
+                    command,
+                    cwd=run.directory,
+                    env={**os.environ, **ENVIRONMENT},
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    # Its copy of the file keeps the lock.
+                    pass_fds=[lock.fileno()],
+                    # Ctrl-C reaches the queue alone, which passes it on once.
+                    start_new_session=True,
+                )
+        print(f"begins    {run}: {shlex.join(command[1:])}", flush=True)
+        self.jobs.append(Job(run, process))
+
+    def _follow(self, job: Job) -> None:
+        if job.process is None:
+            with (job.run.directory / "lock").open("a") as lock:
+                if _locked(lock.fileno()):
+                    self.jobs.remove(job)
+                    self.waiting.appendleft(job.run)
+            return
+        if job.signals < self._signals:
+            job.process.terminate()
+            job.signals = self._signals
+        status = job.process.poll()
+        if status is None:
+            return
+        self.jobs.remove(job)
+        if status == 0:
+            self._report("finished", job.run, f" in {time.monotonic() - job.started:.0f} s")
+        elif self.stopped_by is not None:
+            print(f"stopped   {job.run}", flush=True)
+        else:
+            log = (job.run.directory / "log.txt").read_text(errors="replace")
+            last = "\n".join(f"    {line}" for line in log.splitlines()[-LOG_LINES:])
+            self._fail(job.run, f"status {status}, {job.run.directory}/log.txt ends:\n{last}")
+
+    def _report(self, what: str, run: Run, more: str = "") -> None:
+        self.done += 1
+        print(f"{what:9} {run}{more} ({self.done} of {self.total})", flush=True)
+
+    def _fail(self, run: Run, why: str) -> None:
+        self.failures[str(run)] = why
+        print(f"failed    {run}", flush=True)
+
+
+def _locked(file: int) -> bool:
+    """Take the lock, unless a process has it."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Make the runs; return the exit status."""
+    parser = argument_parser(__doc__)
+    add_selection(parser)
+    add_ignored(parser)
+    parser.add_argument("--runs", type=Path, default=Path("runs/study"), help="directory of runs")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    parser.add_argument("--workers", type=int, default=cores, help="runs at a time")
+    parser.add_argument("--dry-run", action="store_true", help="list the runs")
+    options = parser.parse_args(arguments)
+    if options.workers < 1:
+        parser.error(f"--workers must be at least 1, got {options.workers}")
+    try:
+        manifest = read_manifests(options.manifest)
+        cells = manifest.select(options.only, options.tasks, options.methods, options.seeds)
+        runs = planned_runs(cells, options.runs.resolve(), options.ignore)
+        for cell in cells:
+            assert cell.config, "composed once before anything is run, so that a mistake shows"
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+    if options.dry_run:
+        for run in runs:
+            print(f"{'done' if run.is_done else 'to do'}  {run}  {run.directory}")
+        return 0
+    print(f"{len(runs)} runs, {options.workers} at a time, in {options.runs.resolve()}", flush=True)
+    queue = Queue(runs, options.workers)
+    queue.work()
+    for name, why in queue.failures.items():
+        print(f"\n{name}: {why}")
+    print(f"\n{queue.done} of {queue.total} runs are done, {len(queue.failures)} failed.")
+    if queue.stopped_by is not None:
+        print(f"Stopped by {queue.stopped_by.name}; the same command goes on.")
+        return 128 + queue.stopped_by
+    return int(bool(queue.failures))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,101 @@
+"""What is computed from the curves of runs: scores of each run, and aggregates by rliable."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from rliable.library import get_interval_estimates
+from rliable.metrics import aggregate_iqm, probability_of_improvement
+
+REPETITIONS = 2000  # of the bootstrap
+# A test for each repetition, task and pair of methods takes most of a report's time.
+REPETITIONS_OF_PAIRS = 500
+
+
+class Estimate(NamedTuple):
+    """A number and the 95 % interval of a stratified bootstrap."""
+
+    value: float
+    low: float
+    high: float
+
+
+def area(steps: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Area under the curve over the length of the run: the mean of the metric, ``[runs]``.
+
+    Args:
+        steps: ``[n]``.
+        values: ``[runs, n]``, joined by straight lines.
+
+    Examples:
+        >>> area(np.array([0, 10, 40]), np.array([[0.0, 2.0, 4.0]])).tolist()
+        [2.5]
+    """
+    if len(steps) == 1:
+        return values[:, 0]
+    means = (values[:, 1:] + values[:, :-1]) / 2
+    return means @ np.diff(steps) / (steps[-1] - steps[0])
+
+
+def final(steps: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Mean of the metric over the last tenth of the steps, ``[runs]``.
+
+    Examples:
+        >>> final(np.array([10, 90, 95, 100]), np.array([[0.0, 1.0, 2.0, 4.0]])).tolist()
+        [3.0]
+    """
+    return values[:, steps > 0.9 * steps[-1]].mean(axis=1)
+
+
+def steps_to_solve(steps: np.ndarray, values: np.ndarray, threshold: float) -> np.ndarray:
+    """The step at which the metric first is at the threshold or above; infinite if never.
+
+    Examples:
+        >>> curves = np.array([[0.0, 5.0, 4.0], [0.0, 1.0, 2.0]])
+        >>> steps_to_solve(np.array([10, 20, 30]), curves, 5.0).tolist()
+        [20.0, inf]
+    """
+    is_solved = values >= threshold
+    return np.where(is_solved.any(axis=1), steps[is_solved.argmax(axis=1)], np.inf)
+
+
+def interquartile_means(scores: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
+    """Mean of the middle half of all runs on all tasks, by method.
+
+    Args:
+        scores: ``[runs, tasks]`` by method.
+    """
+    return _estimates(scores, lambda x: np.array([aggregate_iqm(x)]), REPETITIONS)
+
+
+def probabilities_of_improvement(
+    scores: Mapping[str, np.ndarray], method: str
+) -> dict[str, Estimate]:
+    """How likely a run of a method is better than one of each other, mean over tasks.
+
+    Args:
+        scores: ``[runs, tasks]`` by method.
+        method: the one that is compared to each other.
+    """
+    pairs = {other: [scores[method], scores[other]] for other in scores if other != method}
+
+    def probability(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.array([probability_of_improvement(x, y)])
+
+    return _estimates(pairs, probability, REPETITIONS_OF_PAIRS)
+
+
+def _estimates(scores, function, repetitions: int) -> dict[str, Estimate]:
+    # rliable draws from numpy's global generator, whatever random_state it is given.
+    state = np.random.get_state()
+    np.random.seed(0)
+    try:
+        values, intervals = get_interval_estimates(scores, function, reps=repetitions)
+    finally:
+        np.random.set_state(state)
+    return {
+        name: Estimate(float(values[name][0]), *map(float, intervals[name][:, 0]))
+        for name in values
+    }

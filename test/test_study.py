@@ -1,0 +1,597 @@
+"""The study: its manifests, the queue that makes the runs, and what becomes of their results.
+
+The queue starts a script that counts, with the files and the checkpoint of a real run; one slow
+test has it start the real one.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import doctest
+import importlib
+import json
+import os
+import re
+import signal
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+
+STUDY = Path(__file__).parents[1] / "sota-implementations/study"
+MODULES = ("manifest", "records", "results", "scores", "run", "collect", "report")
+
+COUNTER = """
+import json, os, pathlib, sys, time
+
+options = dict(option.split("=", 1) for option in sys.argv[1:])
+seed, total = int(options["seed"]), int(options["total_frames"])
+speed = float(options.get("speed", 1))
+pathlib.Path("config.yaml").write_text(json.dumps({
+    "name": options["name"], "seed": seed, "total_frames": total, "speed": speed,
+    "broken": options.get("broken", "false") == "true", "resume": options["resume"],
+}))
+pathlib.Path("versions.json").write_text('{"python": "3", "torch": "2"}')
+pathlib.Path("starts").open("a").write(options["resume"] + "\\\\n")
+if "broken" in options:
+    raise RuntimeError("the disk of the test is full")
+checkpoint = pathlib.Path("checkpoint")
+begin = int(checkpoint.read_text()) if checkpoint.exists() and options["resume"] == "auto" else 0
+metrics = pathlib.Path("metrics.csv")
+if not begin:
+    metrics.write_text("step,return\\\\n")
+for step in range(begin + 1, total + 1):
+    time.sleep(float(os.environ.get("COUNTER_SLEEP", 0)))
+    with metrics.open("a") as file:
+        file.write(f"{step},{step * speed + seed}\\\\n")
+    checkpoint.write_text(str(step))
+summary = {"finished": True, "frames": total, "seconds": 60.0 * seed}
+pathlib.Path("summary.json").write_text(json.dumps(summary))
+""".replace("\\\\n", "\\n")
+
+
+@pytest.fixture(scope="module")
+def study():
+    """The modules of the study, which are scripts beside each other."""
+    sys.path.insert(0, str(STUDY))
+    try:
+        modules = {name: importlib.import_module(name) for name in MODULES}
+        modules["scores"].REPETITIONS, modules["scores"].REPETITIONS_OF_PAIRS = 200, 20
+        yield SimpleNamespace(**modules)
+    finally:
+        sys.path.remove(str(STUDY))
+        for name in MODULES:
+            sys.modules.pop(name, None)
+
+
+@pytest.fixture
+def counter(tmp_path):
+    """A script that counts, beside its configuration."""
+    folder = tmp_path / "counter"
+    (folder / "config").mkdir(parents=True)
+    config = {"name": "???", "seed": 0, "total_frames": 3, "speed": 1.0, "broken": False}
+    (folder / "config/config.yaml").write_text(yaml.safe_dump({**config, "resume": None}))
+    (folder / "counter.py").write_text(COUNTER)
+    return folder / "counter.py"
+
+
+def plan(tmp_path, counter, *, tasks=None, **studies):
+    """Write a manifest; return its path."""
+    task = {"script": str(counter), "options": "name=one", "steps": 4, "metric": "return"}
+    study = {"title": "A study", "tasks": ["one"], "methods": {"A": "speed=1.0"}, "seeds": "1-2"}
+    content = {
+        "tasks": {"one": task, **{name: {**task, **t} for name, t in (tasks or {}).items()}},
+        "studies": {name: {**study, **entries} for name, entries in studies.items()},
+    }
+    path = tmp_path / "manifest.yaml"
+    path.write_text(yaml.safe_dump(content, sort_keys=False))
+    return path
+
+
+def starts(runs):
+    """How often, and with which resume=, each run was started."""
+    files = sorted(runs.rglob("starts"))
+    return {str(file.parent.relative_to(runs)): file.read_text().split() for file in files}
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_examples(study, name):
+    assert doctest.testmod(getattr(study, name)).failed == 0
+
+
+# --------------------------------------------------------------------------------------- manifest
+
+
+@pytest.mark.parametrize("name", ["study.yaml", "search.yaml"])
+def test_the_committed_manifests_are_read(study, name):
+    manifest = study.manifest.read_manifests()
+    assert yaml.safe_load((STUDY / name).read_text())["studies"].keys() <= manifest.studies.keys()
+
+
+def test_the_study_is_what_was_planned(study):
+    manifest = study.manifest.read_manifests()
+    runs = {
+        name: sum(len(cell.seeds) for cell in manifest.cells(entry))
+        for name, entry in manifest.studies.items()
+    }
+    assert runs["figure1"] == 6 * 3 * 25
+    assert runs["figure2"] == 5 * 4 * 3
+    assert runs["figure3_left"] == 2 * 5 * 10
+    reported = {s for name in ("figure1", "figure2") for s in manifest.studies[name].seeds}
+    searches = [entry for name, entry in manifest.studies.items() if name.startswith("search")]
+    assert len(searches) == 3
+    for search in searches:
+        assert not reported & set(search.seeds), "searched on the reported seeds"
+        cells = [(cell.task.name, cell.method) for cell in manifest.cells(search)]
+        assert len({cells.count(cell) for cell in cells}) == 1, "the search is not equal"
+
+
+@pytest.mark.slow
+def test_every_task_and_every_setting_of_the_study_composes(study):
+    """Each setting on one task, as composing takes long."""
+    one = {}
+    for cell in study.manifest.read_manifests().select():
+        one.setdefault((cell.study, cell.method, cell.setting), cell)
+        one.setdefault(cell.task.name, cell)
+    for cell in set(one.values()):
+        assert cell.identity(1)["seed"] == 1, cell.name
+
+
+def test_a_grid_is_a_product(study, tmp_path, counter):
+    grid = {"speed": [1, 2], "size": {"small": "a=1 b=2", "large": "a=3"}}
+    path = plan(tmp_path, counter, s={"methods": {"A": {"options": "x=0", "grid": grid}}})
+    cells = study.manifest.read_manifests([path]).select()
+    assert [cell.label for cell in cells] == [
+        *("speed 1, size small", "speed 1, size large"),
+        *("speed 2, size small", "speed 2, size large"),
+    ]
+    assert cells[2].options == ("name=one", "x=0", "speed=2", "a=1", "b=2")
+
+
+def test_a_choice_of_studies_tasks_methods_and_seeds(study, tmp_path, counter):
+    methods = {"A": "speed=1.0", "B": "speed=2.0"}
+    tasks = {"two": {"options": "name=two"}}
+    both = {"methods": methods, "tasks": ["one", "two"]}
+    path = plan(tmp_path, counter, tasks=tasks, s=both, t=both)
+    manifest = study.manifest.read_manifests([path])
+    chosen = manifest.select(only=["t"], tasks=["two"], methods=["B"], seeds=[2, 7])
+    assert [(c.study, c.task.name, c.method, c.seeds) for c in chosen] == [("t", "two", "B", (2,))]
+    for wrong in ({"only": ["u"]}, {"tasks": ["three"]}, {"methods": ["C"]}):
+        with pytest.raises(ValueError, match=r"unknown \['\w+'\]; there are \["):
+            manifest.select(**wrong)
+    with pytest.raises(ValueError, match="No run is left"):
+        manifest.select(seeds=[7])
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"seed": "1-3"}, r"study s: unknown \['seed'\]; there are .*'seeds'"),
+        ({"seeds": "1-x"}, "study s: Seeds are written like 1-3,7"),
+        ({"seeds": [1, 1]}, "study s: Seeds must be there, and none twice"),
+        ({"tasks": ["three"]}, r"study s: tasks: unknown \['three'\]; there are \['one'\]"),
+        ({"kind": "map"}, "study s: kind must be one of .*'heat_map'.*, got 'map'"),
+        ({"kind": "heat_map"}, "study s: a heat map needs a grid of two axes"),
+        ({"methods": {"A": ["x=1"]}}, "method A must be options of the script, or a mapping"),
+        ({"scale_by": "Z"}, r"study s: scale_by: unknown \['Z'\]"),
+        ({"steps": 0}, "study s: steps must be an integer of at least 1, got 0"),
+    ],
+)
+def test_a_bad_study_is_refused(study, tmp_path, counter, entries, message):
+    path = plan(tmp_path, counter, s=entries)
+    with pytest.raises(ValueError, match=message):
+        study.manifest.read_manifests([path])
+
+
+def test_missing_seeds_scripts_and_sections_are_refused(study, tmp_path, counter):
+    path = plan(tmp_path, counter, s={})
+    content = yaml.safe_load(path.read_text())
+
+    def refused(message, change):
+        changed = yaml.safe_load(path.read_text())
+        change(changed)
+        (tmp_path / "changed.yaml").write_text(yaml.safe_dump(changed))
+        with pytest.raises(ValueError, match=message):
+            study.manifest.read_manifests([tmp_path / "changed.yaml"])
+
+    refused(r"study s: \['seeds'\] must be given", lambda c: c["studies"]["s"].pop("seeds"))
+    refused(
+        "task one: there is no script no.py", lambda c: c["tasks"]["one"].update(script="no.py")
+    )
+    refused("with .*'studies'.* and nothing else", lambda c: c.update(study={}))
+    assert content["studies"]["s"]["seeds"] == "1-2"
+
+
+def test_an_option_that_the_script_does_not_have_is_refused(study, tmp_path, counter, capsys):
+    path = plan(tmp_path, counter, s={"methods": {"A": "sped=1"}})
+    with pytest.raises(SystemExit):
+        study.run.main(["--manifest", str(path), "--runs", str(tmp_path / "runs")])
+    assert "counter.py name=one sped=1 cannot be run" in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()
+
+
+# ------------------------------------------------------------------------------------------ queue
+
+
+@pytest.fixture
+def run(study, tmp_path, capfd):
+    """Start the queue in this process; return exit status and what it printed."""
+    study.run.POLL = 0.01
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def start(path, *options):
+        arguments = ["--manifest", str(path), "--runs", str(tmp_path / "runs"), "--workers", "2"]
+        status = study.run.main([*arguments, *options])
+        return status, capfd.readouterr().out
+
+    yield start
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+def test_what_is_done_is_skipped_and_more_seeds_are_taken_on(run, tmp_path, counter):
+    path = plan(tmp_path, counter, s={})
+    status, output = run(path)
+    assert status == 0
+    assert "2 of 2 runs are done, 0 failed" in output
+    path = plan(tmp_path, counter, s={"seeds": "1-3"})
+    status, output = run(path)
+    assert status == 0
+    assert output.count("is done") == 2
+    assert output.count("begins ") == 1
+    assert all(len(resumes) == 1 for resumes in starts(tmp_path / "runs").values())
+    assert "done  one/A/seed 3" in run(path, "--dry-run")[1]
+
+
+def test_a_run_that_two_studies_ask_for_is_made_once_and_as_long_as_the_longer(
+    run, tmp_path, counter
+):
+    path = plan(tmp_path, counter, s={"seeds": "1"}, t={"seeds": "1", "steps": 6})
+    assert run(path)[0] == 0
+    (directory,) = (tmp_path / "runs/one").rglob("seed_1")
+    assert json.loads((directory / "summary.json").read_text())["frames"] == 6
+    assert len(starts(tmp_path / "runs")) == 1
+
+
+def test_with_more_steps_a_run_begins_anew(run, tmp_path, counter):
+    assert run(plan(tmp_path, counter, s={"seeds": "1"}))[0] == 0
+    longer = plan(tmp_path, counter, s={"seeds": "1", "steps": 8})
+    assert run(longer)[0] == 0
+    assert list(starts(tmp_path / "runs").values()) == [["auto", "null"]]
+    # A shorter one is part of it.
+    assert "is done" in run(plan(tmp_path, counter, s={"seeds": "1"}))[1]
+
+
+def test_a_failure_is_reported_and_stops_nothing(run, tmp_path, counter):
+    path = plan(tmp_path, counter, s={"methods": {"A": "broken=true", "B": "speed=2.0"}})
+    status, output = run(path)
+    assert status == 1
+    assert "2 of 4 runs are done, 2 failed" in output
+    *_, report = output.partition("2 failed")[0].rpartition("\none/A/seed 2: status 1")
+    assert "RuntimeError: the disk of the test is full" in report
+
+
+def test_a_directory_with_another_configuration_is_not_touched(study, run, tmp_path, counter):
+    path = plan(tmp_path, counter, s={"seeds": "1"})
+    assert run(path)[0] == 0
+    config = counter.parent / "config/config.yaml"
+    config.write_text(config.read_text() + "\nnew_option: 7\n")
+    study.manifest._compose.cache_clear()
+    status, output = run(path)
+    assert status == 1
+    assert "another configuration: new_option was absent, is 7. Remove it" in output
+    assert "is done" in run(path, "--ignore", "new_option")[1]
+
+
+def fork_queue(study, path, runs):
+    """The queue in a process of its own, which its runs outlive."""
+    process = os.fork()
+    if process:
+        return process
+    os.environ["COUNTER_SLEEP"] = "0.2"
+    try:
+        status = study.run.main(
+            ["--manifest", str(path), "--runs", str(runs), "--workers", "2"],
+        )
+    except BaseException:
+        status = 99
+    os._exit(status)
+
+
+def wait_for_rows(runs, number):
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        files = list(runs.rglob("metrics.csv"))
+        if len(files) == 2 and all(len(file.read_text().split()) > number for file in files):
+            return
+        time.sleep(0.01)
+    raise AssertionError("the runs have not begun")
+
+
+def test_a_killed_queue_goes_on_and_makes_no_run_twice(study, run, tmp_path, counter):
+    path, runs = plan(tmp_path, counter, s={"seeds": "1-3", "steps": 8}), tmp_path / "runs"
+    process = fork_queue(study, path, runs)
+    wait_for_rows(runs, 2)
+    os.kill(process, signal.SIGKILL)
+    os.waitpid(process, 0)
+    status, output = run(path)
+    assert status == 0, output
+    assert output.count("another process runs it") == 2
+    assert "3 of 3 runs are done, 0 failed" in output
+    assert list(starts(runs).values()) == [["auto"]] * 3
+    for file in runs.rglob("metrics.csv"):
+        with file.open() as rows:
+            assert [int(row["step"]) for row in csv.DictReader(rows)] == list(range(1, 9))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_stopped_queue_stops_its_runs_and_goes_on_where_they_were(
+    study, run, tmp_path, counter, number
+):
+    path, runs = plan(tmp_path, counter, s={"seeds": "1-3", "steps": 8}), tmp_path / "runs"
+    process = fork_queue(study, path, runs)
+    wait_for_rows(runs, 2)
+    os.kill(process, number)
+    _, status = os.waitpid(process, 0)
+    assert os.waitstatus_to_exitcode(status) == 128 + number
+    assert len(starts(runs)) == 2, "a run was begun after the signal"
+    rows = [file.read_text() for file in sorted(runs.rglob("metrics.csv"))]
+    time.sleep(0.5)
+    assert [file.read_text() for file in sorted(runs.rglob("metrics.csv"))] == rows
+    status, output = run(path)
+    assert status == 0, output
+    assert "another process" not in output
+    assert sorted(starts(runs).values()) == [["auto"], ["auto", "auto"], ["auto", "auto"]]
+
+
+# ---------------------------------------------------------------------------- collecting, reporting
+
+
+def make_runs(run, path):
+    status, output = run(path)
+    assert status == 0, output
+
+
+def collect(study, tmp_path, path, *options):
+    results = ["--results", str(tmp_path / "results")]
+    study.collect.main([*(options or [str(tmp_path / "runs")]), "--manifest", str(path), *results])
+    return study.results.Results.read(tmp_path / "results/study/s")
+
+
+def test_runs_are_told_by_their_configuration_wherever_they_are(
+    study, run, tmp_path, counter, capfd
+):
+    path = plan(tmp_path, counter, s={"steps": 200})
+    make_runs(run, path)
+    (tmp_path / "runs/one").rename(tmp_path / "by_hand")
+    results = collect(study, tmp_path, path, str(tmp_path / "by_hand"))
+    assert sorted(results.runs) == [("one", "A", "", 1), ("one", "A", "", 2)]
+    row = results.runs["one", "A", "", 2]
+    assert row["reached"] == "200"
+    assert row["seconds"] == "120.0"
+    assert row["options"] == "name=one speed=1.0"
+    assert row["torch"] == "2"
+    # The mean of steps 1 and 2, plus the seed; then of 3 and 4.
+    assert results.curves["one", "A", "", 2][:2] == [
+        {"step": 2, "return": 3.5},
+        {"step": 4, "return": 5.5},
+    ]
+    assert results.configs["one/A"]["speed"] == 1.0
+    other = plan(tmp_path, counter, s={"methods": {"B": "speed=3.0"}, "steps": 200})
+    collect(study, tmp_path, other, str(tmp_path / "by_hand"), "--unmatched")
+    output = capfd.readouterr().out
+    assert "nearest is one/B, but speed was 3.0, is 1.0" in output
+    assert "2 of 2 runs are in no cell" in output
+    results = collect(study, tmp_path, other, str(tmp_path / "by_hand"), "--ignore", "speed")
+    assert len(results.runs) == 4
+
+
+def test_results_stay_unless_a_run_went_further_or_the_cell_has_changed(
+    study, run, tmp_path, counter, capfd
+):
+    path = plan(tmp_path, counter, s={})
+    make_runs(run, path)
+    first = collect(study, tmp_path, path)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert collect(study, tmp_path, path, str(empty)) == first
+    make_runs(run, plan(tmp_path, counter, s={"steps": 6, "seeds": "1"}))
+    longer = collect(study, tmp_path, path)
+    assert longer.runs["one", "A", "", 1]["reached"] == "6"
+    assert longer.runs["one", "A", "", 2] == first.runs["one", "A", "", 2]
+    changed = plan(tmp_path, counter, s={"methods": {"A": "speed=2.0"}, "seeds": "1"})
+    make_runs(run, changed)
+    results = collect(study, tmp_path, changed)
+    assert list(results.runs) == [("one", "A", "", 1)]
+    assert "results of one/A are dropped, for speed was 1.0, is 2.0" in capfd.readouterr().out
+
+
+def synthetic(study, tmp_path, counter, curves, steps=100, **entries):
+    """A manifest and committed results: by task and method, what the return is at each seed."""
+    tasks = {task: {"steps": steps, "solved": 5, "best": 10.0} for task, _ in curves}
+    methods = {
+        method: f"speed={i + 1}" for i, method in enumerate(dict.fromkeys(m for _, m in curves))
+    }
+    path = plan(
+        tmp_path, counter, tasks=tasks, s={"tasks": list(tasks), "methods": methods, **entries}
+    )
+    manifest = study.manifest.read_manifests([path])
+    results = study.results.Results(tmp_path / "results/study/s")
+    for cell in manifest.cells(manifest.studies["s"]):
+        for seed, slope in curves[cell.task.name, cell.method].items():
+            at = np.arange(1, steps + 1)
+            record = SimpleNamespace(
+                identity={"speed": cell.method},
+                seed=seed,
+                reached=steps,
+                metrics={"step": at, "return": slope * at / steps},
+                unit="frames",
+                finished=True,
+                summary={"seconds": 90},
+                versions={"torch": "2"},
+            )
+            results.add(cell, record, ["return"])
+    results.write()
+    return manifest
+
+
+def report(study, manifest, tmp_path, name):
+    docs = tmp_path / name
+    docs.mkdir()
+    page = study.report.write_report(manifest, tmp_path / "results", docs)
+    return page.read_text(), {file.name: file.read_bytes() for file in docs.rglob("*.*")}
+
+
+def test_the_report_is_the_same_each_time_and_says_what_is_missing(study, tmp_path, counter):
+    curves = {
+        ("copy", "A"): {1: 10.0, 2: 9.0, 3: 8.0},
+        ("copy", "B"): {1: 4.0, 2: 3.0},
+        ("reverse", "A"): {1: 10.0, 2: 6.0, 3: 7.0},
+        ("reverse", "B"): {1: 2.0, 2: 8.0},
+    }
+    manifest = synthetic(study, tmp_path, counter, curves, seeds="1-3")
+    state = np.random.get_state()[1].copy()
+    text, files = report(study, manifest, tmp_path, "docs")
+    assert (np.random.get_state()[1] == state).all()
+    np.random.random()  # another state, on which nothing may depend
+    assert report(study, manifest, tmp_path, "again")[1] == files
+    assert {"study.md", "s.svg", "s.png"} == files.keys()
+    assert "| copy | A | `name=one speed=1` | 100 | 3 | 1-3 | 1.5 |" in text
+    assert "| copy | B | `name=one speed=2` | 100 | **2 of 3 planned** | 1-2 | 1.5 |" in text
+    # B: 2 of 3 runs; the mean of 91 to 100 hundredths of 4 and 3; never 5, of 100 steps.
+    assert "| copy | B | 2 of 3 | 1.768 ± 0.252 | 3.3 ± 0.5 | 0% | > 100 |" in text
+    # Slopes of 10, 9 and 8 are at 5 after 50, 56 and 63 steps.
+    assert "| 100% | 56 |" in text
+    assert "probability that A is better" in text
+
+
+def test_the_aggregates_of_a_synthetic_study(study, tmp_path, counter):
+    always = {
+        ("copy", "A"): {1: 10.0, 2: 8.0, 3: 6.0, 4: 4.0},
+        ("copy", "B"): {1: 1.0, 2: 2.0, 3: 1.5, 4: 1.2},
+    }
+    manifest = synthetic(study, tmp_path, counter, always, seeds="1-4")
+    text, _ = report(study, manifest, tmp_path, "docs")
+    # Final scores are 0.955 of the slopes; the middle half of A is 8 and 6, of 10.
+    assert "| A | 4 | 0.67 (" in text
+    assert re.search(r"\| B \| 4 \| 0\.13 \(.*\) \| 1\.00 \(1\.00 to 1\.00\) \|", text)
+
+
+def test_a_heat_map_and_a_ranking(study, tmp_path, counter):
+    grid = {"options": "", "grid": {"speed": [1, 2], "size": [3, 4]}}
+    path = plan(
+        tmp_path,
+        counter,
+        map={"methods": {"A": grid}, "kind": "heat_map", "steps": 100},
+        search={"methods": {"A": grid}, "kind": "ranking", "steps": 100},
+    )
+    manifest = study.manifest.read_manifests([path])
+    for name, entry in manifest.studies.items():
+        results = study.results.Results(tmp_path / "results/study" / name)
+        for value, cell in enumerate(manifest.cells(entry)[:3]):
+            record = SimpleNamespace(
+                **{"identity": {}, "seed": 1, "reached": 100, "unit": "frames", "finished": True},
+                **{"summary": {}, "versions": {}, "metrics": {"step": [100], "return": [value]}},
+            )
+            results.add(cell, record, ["return"])
+        results.write()
+    text, files = report(study, manifest, tmp_path, "docs")
+    assert {"map_one_a.svg", "map_one_a.png"} <= files.keys()
+    best = "speed 2, size 3: 2.0 (1 of 2 runs) | speed 1, size 4: 1.000 (1 of 2 runs)"
+    assert f"| one | A | 3 of 4 | {best} | speed 1, size 3: 0.000 (1 of 2 runs) |" in text
+    assert "| one | A | 4 | 100 | **3 of 8 planned** | 1 |" in text
+
+
+def test_runs_with_other_options_than_the_manifest_now_has_do_not_count(study, tmp_path, counter):
+    manifest = synthetic(study, tmp_path, counter, {("copy", "A"): {1: 1.0, 2: 2.0}})
+    entry = manifest.studies["s"]
+    results = study.results.Results.read(tmp_path / "results/study/s")
+    (cell,) = manifest.cells(entry)
+    assert len(study.report.read_cell(cell, results).runs) == 2
+    other = dataclasses.replace(cell, options=("name=one", "speed=9"))
+    assert study.report.read_cell(other, results).runs == {}
+    longer = dataclasses.replace(cell, steps=200)
+    assert study.report.read_cell(longer, results).unfinished == 2
+
+
+def test_runs_that_were_measured_at_other_steps_keep_their_latest_value(study):
+    one, other = np.array([[10, 1.0], [30, 3.0]]), np.array([[20, 5.0], [40, 7.0]])
+    steps, values = study.report.align([one, other])
+    assert steps.tolist() == [20, 30, 40]
+    assert values.tolist() == [[1, 3, 3], [5, 5, 7]]
+
+
+# ------------------------------------------------------------------------------------------ scores
+
+
+def test_scores_by_hand(study):
+    steps = np.array([0.0, 10.0, 20.0, 40.0])
+    values = np.array([[0.0, 2.0, 4.0, 4.0], [4.0, 0.0, 0.0, 1.0]])
+    # (10 * 1 + 10 * 3 + 20 * 4) / 40 and (10 * 2 + 0 + 20 * 0.5) / 40
+    assert study.scores.area(steps, values).tolist() == [3.0, 0.75]
+    assert study.scores.final(steps, values).tolist() == [4.0, 1.0]
+    assert study.scores.steps_to_solve(steps, values, 4.0).tolist() == [20.0, 0.0]
+    assert study.scores.steps_to_solve(steps, values, 4.5).tolist() == [np.inf, np.inf]
+
+
+def test_the_last_tenth_is_a_tenth(study):
+    steps = np.arange(1.0, 101.0)
+    assert study.scores.final(steps, steps[None]).tolist() == [95.5]
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([[5.0], [5.0], [5.0]], ["100%", "1"]),
+        ([[5.0], [1.0], [5.0]], ["67%", "1"]),
+        ([[5.0], [1.0]], ["50%", "> 1"]),
+        ([[1.0], [1.0]], ["0%", "> 1"]),
+    ],
+)
+def test_share_and_median_of_runs_that_solve_a_task(study, values, expected):
+    curve = (np.array([1.0]), np.array(values))
+    assert study.report.scores("", curve, 5.0)[-2:] == expected
+    assert study.report.scores("", curve, None)[-2:] == ["", ""]
+
+
+def test_interquartile_mean_and_probability_of_improvement_by_hand(study):
+    # The middle half of 1, 2, 3, 4, 5, 6, 7, 100 is 3, 4, 5, 6.
+    scores = {"A": np.array([[1, 2], [3, 4], [5, 6], [7, 100.0]])}
+    estimate = study.scores.interquartile_means(scores)["A"]
+    assert estimate.value == 4.5
+    assert 1 < estimate.low < 4.5 < estimate.high
+    # Of the four pairs, 3 beats 1 and 2; 1 and 2 tie with, or lose to, 2.
+    pairs = {"A": np.array([[3.0], [2.0]]), "B": np.array([[1.0], [2.0]])}
+    better = study.scores.probabilities_of_improvement(pairs, "A")
+    assert better["B"].value == (2 + 1 + 0.5) / 4
+
+
+# -------------------------------------------------------------------------------------- really run
+
+
+@pytest.mark.slow
+def test_the_bandit_from_manifest_to_report(study, run, tmp_path):
+    task = {
+        "script": "ecpo/ecpo.py",
+        "options": "env=bandit env.num_actions=30 group_size=10",
+        "steps": 60,
+        "metric": "expected_reward",
+        "best": 1.0,
+    }
+    methods = {"ECPO": "loss=ecpo", "UREX": "loss=urex"}
+    entry = {"title": "B", "tasks": ["b"], "methods": methods, "seeds": "1-2", "also": ["entropy"]}
+    path = tmp_path / "manifest.yaml"
+    path.write_text(yaml.safe_dump({"tasks": {"b": task}, "studies": {"s": entry}}))
+    make_runs(run, path)
+    results = collect(study, tmp_path, path)
+    assert len(results.runs) == 4
+    assert set(results.curves["b", "ECPO", "", 1][0]) == {"step", "expected_reward", "entropy"}
+    manifest = study.manifest.read_manifests([path])
+    text, files = report(study, manifest, tmp_path, "docs")
+    assert {"s.svg", "s_entropy.svg"} <= files.keys()
+    assert "IQM" in text
