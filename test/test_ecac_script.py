@@ -44,6 +44,11 @@ def tiny(overrides):
     return TINY if is_ecac else TINY[:-1]
 
 
+def configure(overrides):
+    with initialize_config_dir(str(SCRIPT / "config"), version_base="1.3"):
+        return compose("config", overrides)
+
+
 def run_ecac(directory, *overrides):
     process = start(directory, *tiny(overrides), f"hydra.run.dir={directory}", *overrides)
     assert process.returncode == 0, process.stderr
@@ -166,8 +171,7 @@ def test_an_unknown_task_is_refused_before_anything_starts(tmp_path):
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
 def test_bad_options_end_with_a_clear_message(utils, overrides, message):
-    with initialize_config_dir(str(SCRIPT / "config"), version_base="1.3"):
-        config = compose("config", [*TINY, *overrides])
+    config = configure([*TINY, *overrides])
     with pytest.raises(ValueError, match=message):  # noqa: PT012 - the script's first steps
         utils.check_config(config)
         env = utils.make_environment(config, seed=0)
@@ -216,6 +220,53 @@ def test_time_limits_are_truncations(utils, name, ends_early):
     assert last["terminated"].item() is ends_early
     assert last["truncated"].item() is not ends_early
     assert last["observation"].dtype == torch.float32
+
+
+@pytest.mark.parametrize("loss", ["ecac", "pmd_ac", "sac", "sac_score"])
+def test_the_way_q_networks_are_called_changes_no_number(utils, monkeypatch, loss):
+    config = configure(["hidden_sizes=[16,16]", f"loss={loss}"])
+    env = utils.make_environment(config, seed=0)
+    never = torch.zeros(256, 1, dtype=torch.bool)
+    torch.manual_seed(0)
+    batch = TensorDict(
+        {
+            "observation": torch.randn(256, 3),
+            "action": torch.rand(256, 1),
+            "next": {
+                "observation": torch.randn(256, 3),
+                "reward": torch.randn(256, 1),
+                "done": never,
+                "terminated": never,
+            },
+        },
+        [256],
+    )
+
+    def losses_and_gradients():
+        torch.manual_seed(0)
+        loss_module = utils.make_loss(config, utils.make_actor(config, env), env)
+        utils.make_updater(config, loss_module)
+        losses = loss_module(batch.copy())
+        sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
+        return losses.detach().to_dict(), [each.grad for each in loss_module.parameters()]
+
+    ours = losses_and_gradients()
+    monkeypatch.setattr(utils, "_call_each_qvalue", lambda loss_module: None)
+    torch.testing.assert_close(ours, losses_and_gradients())
+
+
+def test_adam_has_a_group_for_each_learning_rate(utils):
+    config = configure(["hidden_sizes=[16,16]"])
+    env = utils.make_environment(config, seed=0)
+    loss_module = utils.make_loss(config, utils.make_actor(config, env), env)
+    rates = {
+        parameter: group["lr"]
+        for group in utils.make_optimizer(config.loss.lr, loss_module).param_groups
+        for parameter in group["params"]
+    }
+    for name, parameter in loss_module.named_parameters():
+        assert rates[parameter] == config.loss.lr[name.split(".")[0].removesuffix("_params")]
+    assert len(rates) == len(list(loss_module.parameters()))
 
 
 def test_every_asks_once_an_interval(utils):

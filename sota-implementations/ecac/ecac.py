@@ -30,9 +30,9 @@ from utils import (
     make_updater,
     mean,
     scalars,
-    shut_down,
 )
 
+from torchrl_ecpo.collectors import shut_down
 from torchrl_ecpo.experiment import Checkpoints, Progress, Run
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -17,7 +16,7 @@ from score_sac import ScoreSACLoss
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
-from torchrl.collectors import Collector
+from torchrl.collectors import BaseCollector, Collector
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer
 from torchrl.envs import (
     CatTensors,
@@ -43,6 +42,7 @@ from torchrl_ecpo import (
     TemperatureScheduler,
     UpdaterSequence,
 )
+from torchrl_ecpo.collectors import SupervisedAsyncCollector, SupervisedSyncCollector
 from torchrl_ecpo.envs import EpisodeReplay
 from torchrl_ecpo.modules import (
     make_deterministic_actor,
@@ -168,7 +168,21 @@ def make_loss(config: DictConfig, actor: TensorDictModuleBase, env: EnvBase) -> 
         options["noise_clip"] *= _half_range(action_spec)
     loss_module = LOSSES[config.loss.name](actor, *critics, **options)
     loss_module.make_value_estimator(gamma=config.gamma)
+    _call_each_qvalue(loss_module)
     return loss_module
+
+
+def _call_each_qvalue(loss_module: Any) -> None:
+    """Let the losses with one set of inputs for all Q networks call :meth:`DenseNetwork.each`.
+
+    It takes the place of vmap. (TorchRL's own replacement, ``deactivate_vmap``, copies and stacks
+    the inputs too; the numbers are the same.)
+    """
+    if isinstance(loss_module, SACLoss):
+        loss_module._vmap_qnetworkN0 = loss_module.qvalue_network.each
+    elif isinstance(loss_module, ECACLoss | PMDACLoss):
+        loss_module._vmap_qvalue = loss_module.qvalue_network.each
+        loss_module.deactivate_vmap = False
 
 
 def make_temperatures(config: DictConfig, loss_module: LossModule) -> TemperatureScheduler:
@@ -199,17 +213,20 @@ def make_updater(config: DictConfig, loss_module: LossModule) -> TargetNetUpdate
 
 def make_optimizer(learning_rates: DictConfig, loss_module: LossModule) -> torch.optim.Optimizer:
     """Adam, with a learning rate for each network and each learned temperature."""
-    groups: dict[str, list[Tensor]] = {}
+    networks: dict[str, list[Tensor]] = {}
     for name, parameter in loss_module.named_parameters():
         owner = name.split(".")[0].removesuffix("_params")
-        groups.setdefault(owner, []).append(parameter)
-    if groups.keys() != set(learning_rates):
+        networks.setdefault(owner, []).append(parameter)
+    if networks.keys() != set(learning_rates):
         raise ValueError(
-            f"loss.lr must have a learning rate for each of {sorted(groups)}, got "
+            f"loss.lr must have a learning rate for each of {sorted(networks)}, got "
             f"{sorted(map(str, learning_rates))}."
         )
+    groups: dict[float, list[Tensor]] = {}  # by rate: fewer groups are less overhead
+    for owner, parameters in networks.items():
+        groups.setdefault(learning_rates[owner], []).extend(parameters)
     return torch.optim.Adam(
-        [{"params": groups[name], "lr": learning_rates[name]} for name in groups], fused=True
+        [{"params": parameters, "lr": rate} for rate, parameters in groups.items()], fused=True
     )
 
 
@@ -241,7 +258,7 @@ def _plain(setting: DictConfig) -> Any:
 # --------------------------------------------------------------------------------------------- data
 
 
-def make_collector(config: DictConfig, policy: TensorDictModuleBase) -> Collector:
+def make_collector(config: DictConfig, policy: TensorDictModuleBase) -> BaseCollector:
     """One collector in this process, or several in processes of their own."""
     options: dict[str, Any] = {
         "frames_per_batch": config.collector.frames_per_batch,
@@ -250,11 +267,12 @@ def make_collector(config: DictConfig, policy: TensorDictModuleBase) -> Collecto
         "auto_register_policy_transforms": False,
     }
     if config.collector.kind == "single":
-        return Collector(make_environment(config, seed=config.seed), policy, **options)
+        env = make_environment(config, seed=config.seed)
+        return Collector(env, policy, track_traj_ids=False, **options)
     seeds = range(config.seed, config.seed + config.collector.num_collectors)
     makers = [partial(_make_worker_environment, config, seed) for seed in seeds]
-    is_sync = config.collector.kind == "multi_sync"
-    return Collector(makers, policy, num_collectors=len(makers), sync=is_sync, **options)
+    make = {"multi_sync": SupervisedSyncCollector, "multi_async": SupervisedAsyncCollector}
+    return make[config.collector.kind](makers, policy, **options)
 
 
 def _make_worker_environment(config: DictConfig, seed: int) -> EnvBase:
@@ -277,15 +295,6 @@ def make_replay_buffer(config: DictConfig) -> ReplayBuffer:
         batch_size=config.replay_buffer.batch_size,
         generator=torch.Generator().manual_seed(config.seed),
     )
-
-
-@contextmanager
-def shut_down(collector: Any) -> Iterator[None]:
-    """End a collector however the run ends: its worker processes would keep the script alive."""
-    try:
-        yield
-    finally:
-        collector.shutdown()
 
 
 class CollectorState:
@@ -311,7 +320,6 @@ class CollectorState:
             self.collector.load_state_dict(
                 {name: value for name, value in state_dict.items() if name != "carrier"}
             )
-            self.collector._traj_pool.load_state_dict(state_dict["traj_pool"])
             self.collector._carrier = self.collector._carrier.empty().update(carrier)
 
 

@@ -50,6 +50,25 @@ def test_a_dense_network_computes_what_an_mlp_does(hidden, dtype):
     torch.testing.assert_close(network(a=td["a"], b=td["b"]), expected)
 
 
+def test_each_of_several_sets_of_parameters_gives_what_vmap_does():
+    torch.manual_seed(0)
+    network = DenseNetwork(["a", "b"], ["out"], [5, 8, 2])
+    params = TensorDict.from_modules(network, DenseNetwork(["a", "b"], ["out"], [5, 8, 2]))
+    params = params.data.requires_grad_()
+    inputs = TensorDict({"a": torch.randn(4, 3), "b": torch.randn(4, 2, requires_grad=True)}, [4])
+
+    def call(params):
+        with params.to_module(network, preserve_module_state=False):
+            return network(inputs.copy())["out"]
+
+    outputs = [network.each(inputs, params)["out"], torch.vmap(call)(params)]
+    assert set(inputs.keys()) == {"a", "b"}
+    torch.testing.assert_close(*outputs)
+    leaves = [inputs["b"], *params.values()]
+    gradients = [torch.autograd.grad(output.square().sum(), leaves) for output in outputs]
+    torch.testing.assert_close(*gradients)
+
+
 def test_a_dense_network_starts_as_layers_of_torch_do():
     torch.manual_seed(0)
     network = DenseNetwork(["a"], ["out"], [100, 400, 1])

@@ -7,12 +7,12 @@ within the bounds of its specification.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModuleBase,
@@ -41,8 +41,8 @@ class DenseNetwork(TensorDictModuleBase):
 
     It computes what ``TensorDictModule(MLP(...))`` does. The update of an actor-critic calls its
     networks eight times on small batches and swaps their parameters each time, so what surrounds
-    the matrix products counts: here all parameters belong to one module, and outputs are written as
-    they are. That saves about a seventh of the time of an update by ``SACLoss``.
+    the matrix products counts: here all parameters belong to one module, outputs are written as
+    they are, and :meth:`each` calls several Q networks without swapping anything.
 
     Args:
         in_keys: entries to read, ``[..., n]`` each; they are concatenated.
@@ -69,30 +69,70 @@ class DenseNetwork(TensorDictModuleBase):
         self.in_keys, self.out_keys = list(in_keys), list(out_keys)
         self.sizes = tuple(sizes)
         self.head = head
-        self._names = [(f"weight_{i}", f"bias_{i}") for i in range(len(sizes) - 1)]
-        for (weight, bias), fan_in, fan_out in zip(self._names, sizes, sizes[1:], strict=False):
+        self._names = [name for i in range(len(sizes) - 1) for name in (f"weight_{i}", f"bias_{i}")]
+        for weight, bias, fan_in, fan_out in self._layers():
             self.register_parameter(weight, nn.Parameter(torch.empty(fan_out, fan_in)))
             self.register_parameter(bias, nn.Parameter(torch.empty(fan_out)))
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
         """Draw all parameters anew, as ``torch.nn.Linear`` does: uniform up to 1/sqrt(fan-in)."""
-        for (weight, bias), fan_in in zip(self._names, self.sizes, strict=False):
+        for weight, bias, fan_in, _ in self._layers():
             for name in (weight, bias):
                 nn.init.uniform_(getattr(self, name), -(fan_in**-0.5), fan_in**-0.5)
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the outputs into ``tensordict``."""
+        parameters = [getattr(self, name) for name in self._names]
+        return self._write(self._compute(self._read(tensordict), parameters), tensordict)
+
+    def each(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
+        """The outputs with each of N sets of parameters, on the same inputs.
+
+        It stands for ``torch.vmap`` over the parameters, and for TorchRL's loop that replaces it,
+        in the losses that have several Q networks. On a CPU it is faster than either: parameters
+        are not swapped in and out of the module, and nothing but the outputs is stacked.
+
+        Args:
+            tensordict: with the entries to read; left as it is.
+            params: parameters by their names, stacked along the first dimension.
+
+        Returns:
+            A TensorDict of the outputs only, ``[N, ..., n]``.
+
+        Examples:
+            >>> import torch
+            >>> from tensordict import TensorDict
+            >>> network = DenseNetwork(["observation"], ["state_value"], [3, 8, 1])
+            >>> twice = TensorDict.from_module(network).expand(2)
+            >>> network.each(TensorDict(observation=torch.zeros(5, 3)), twice)["state_value"].shape
+            torch.Size([2, 5, 1])
+        """
+        x = self._read(tensordict)
+        sets = zip(*(params.get(name).unbind(0) for name in self._names), strict=True)
+        outputs = [self._compute(x, parameters) for parameters in sets]
+        return self._write(torch.stack(outputs), TensorDict())
+
+    def _layers(self) -> Iterator[tuple[str, str, int, int]]:
+        """Names of weight and bias of each layer, and its numbers of inputs and outputs."""
+        return zip(self._names[::2], self._names[1::2], self.sizes, self.sizes[1:], strict=False)
+
+    def _read(self, tensordict: TensorDictBase) -> Tensor:
         inputs = [tensordict.get(key) for key in self.in_keys]
-        x = torch.cat(inputs, -1) if len(inputs) > 1 else inputs[0]
-        for weight, bias in self._names[:-1]:
-            x = torch.relu(linear(x, getattr(self, weight), getattr(self, bias)))
-        weight, bias = self._names[-1]
-        x = linear(x, getattr(self, weight), getattr(self, bias))
-        outputs = (x,) if self.head is None else self.head(x)
-        for key, output in zip(self.out_keys, outputs, strict=True):
-            tensordict.set(key, output)
+        return torch.cat(inputs, -1) if len(inputs) > 1 else inputs[0]
+
+    @staticmethod
+    def _compute(x: Tensor, parameters: Sequence[Tensor]) -> Tensor:
+        *hidden, last = zip(parameters[::2], parameters[1::2], strict=True)
+        for weight, bias in hidden:
+            x = linear(x, weight, bias).relu_()  # what goes into it is read by nobody else
+        return linear(x, *last)
+
+    def _write(self, output: Tensor, tensordict: TensorDictBase) -> TensorDictBase:
+        outputs = (output,) if self.head is None else self.head(output)
+        for key, value in zip(self.out_keys, outputs, strict=True):
+            tensordict.set(key, value)
         return tensordict
 
 
