@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+import os
+import signal
 import time
 from functools import partial
 
 import pytest
+import ray
 import torch
 from tensordict import TensorDict
 from tensordict import assert_close as assert_td_close
@@ -19,7 +22,7 @@ from torchrl.data import (
 from torchrl.envs import EnvBase, InitTracker, RewardSum, StepCounter, TransformedEnv
 from torchrl.modules import LSTMModule, RandomPolicy, get_env_transforms_from_module
 
-from torchrl_ecpo.collectors import TrajectoryGroupCollector
+from torchrl_ecpo.collectors import TrajectoryGroupCollector, shut_down
 from torchrl_ecpo.data import TrajectoryGroupSampler, pack_groups, unpack_groups
 from torchrl_ecpo.envs._groups import GroupIdAllocator
 
@@ -388,7 +391,11 @@ class Stranger(Countdown):
         ({"init_random_frames": 10}, TypeError, "every action comes from the policy"),
         ({"split_trajs": True}, TypeError, "does not take split_trajs"),
         ({"sync": True}, ValueError, "sync needs num_collectors"),
-        ({"backend": "ray"}, ValueError, "backend='ray'.*'process'"),
+        ({"backend": "rpc"}, ValueError, "backend='rpc'.*'process' and 'ray'"),
+        ({"backend_options": {}}, ValueError, "backend_options are for backend='ray'"),
+        ({"backend": "ray", "num_collectors": 2, "sync": False}, ValueError, "with Ray, workers"),
+        ({"backend": "ray", "num_collectors": 2, "num_groups": 3}, ValueError, "workers, 2"),
+        ({"backend": "ray", "num_collectors": 2, "replay_buffer": []}, TypeError, "extend it"),
         ({"num_collectors": 2, "num_groups": 3, "sync": True}, ValueError, "number of workers, 2"),
         ({"nonsense": 1}, TypeError, "nonsense"),
     ],
@@ -485,9 +492,13 @@ def test_worker_processes(sync):
             with torch.no_grad():
                 policy.module.weight.fill_(i)
             collector.update_policy_weights_()
-    finally:
         restarted = collector.restarted_trajectories
+        os.kill(collector.procs[0].pid, signal.SIGKILL)
+        with pytest.raises(ChildProcessError, match=r"Worker 0 .* by SIGKILL.* resume=auto"):
+            collector.update_policy_weights_()
+    finally:
         collector.shutdown()
+    assert not any(process.is_alive() for process in collector.procs)
     assert 250 <= frames < 250 + (4 if sync else 2) * 3 * 6  # a batch's groups, copies and steps
     assert len(set(groups)) == len(groups)
     if sync:
@@ -498,6 +509,54 @@ def test_worker_processes(sync):
         assert restarted % 6 == 0
         assert weights == sorted(weights)
         assert len(set(weights)) > 2
+
+
+def test_an_error_in_a_worker_process_ends_the_run():
+    make, policy = _worker_parts()
+
+    def make_failing():
+        env = make()
+        env._step = lambda tensordict: 1 / 0
+        return env
+
+    collector = TrajectoryGroupCollector(
+        make_failing, policy, num_groups=2, group_size=3, num_collectors=1, sync=True
+    )
+    with shut_down(collector), pytest.raises(ChildProcessError, match=r"Worker 0 .* exit code 1"):
+        next(iter(collector))
+
+
+def test_ray_workers():
+    make, policy = _worker_parts()
+    collector = TrajectoryGroupCollector(
+        make, policy, num_groups=4, group_size=3, backend="ray", num_collectors=2,
+        total_frames=250, postproc=lambda batch: batch.set("seen", torch.ones(batch.shape)),
+        backend_options={
+            "ray_init_config": {"address": "local", "num_cpus": 2, "include_dashboard": False},
+            "remote_configs": {"num_cpus": 1, "num_gpus": 0},
+        },
+    )  # fmt: skip
+    frames, groups = 0, []
+    with shut_down(collector):
+        collector.set_seed(0)
+        collector.update_policy_weights_()
+        for i, batch in enumerate(collector, start=1):
+            check_batch(batch, 4, 3)
+            assert batch["seen"].all()
+            frames += int(batch["collector", "mask"].sum())
+            groups += batch["group"][:, 0, 0].tolist()
+            # All workers sampled from the weights of the last update.
+            assert (batch["action"][batch["collector", "mask"]] == i - 1).all()
+            with torch.no_grad():
+                policy.module.weight.fill_(i)
+            collector.update_policy_weights_()
+            if frames >= 200:  # at its end, TorchRL shuts the collector down
+                break
+        assert len(set(groups)) == len(groups)
+        assert collector.restarted_trajectories == 0
+        ray.kill(collector.remote_collectors[1])
+        with pytest.raises(ChildProcessError, match=r"Worker 1 .* Ray cluster.* resume=auto"):
+            collector.update_policy_weights_()
 
 
 @pytest.mark.slow

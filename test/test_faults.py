@@ -141,3 +141,48 @@ def test_a_disk_that_is_full(tmp_path, capsys):
         subprocess.check_call(["umount", str(disk)])
     with capsys.disabled():
         print(f"\nfull disk: the run ended with {last!r} and was resumed on a larger one")
+
+
+def worker_processes(parent):
+    """The processes that a process has spawned to collect."""
+    children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
+    commands = {int(child): Path(f"/proc/{child}/cmdline").read_text() for child in children}
+    return [child for child, command in commands.items() if "spawn_main" in command]
+
+
+@pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
+@pytest.mark.parametrize("name", ["copy", "pendulum"])
+def test_a_worker_process_that_is_killed(tmp_path, capsys, name, kind):
+    script, *options = RUNS[name]
+    command = [
+        *(sys.executable, str(SCRIPTS / script / f"{script}.py"), *options),
+        *(f"collector={kind}", "resume=auto", f"hydra.run.dir={tmp_path}", "checkpoint.interval=0"),
+        "checkpoint.max_share=1",
+    ]
+    generator = random.Random(name + kind)
+    process = subprocess.Popen(command, stdout=-1, stderr=subprocess.STDOUT, text=True)
+    try:
+        while number_of_rows(tmp_path) < 3:
+            time.sleep(0.05)
+            assert process.poll() is None, process.communicate()[0]
+        time.sleep(generator.uniform(0.0, 0.2))
+        worker = generator.randrange(2)
+        os.kill(worker_processes(process.pid)[worker], signal.SIGKILL)
+        killed_at = time.monotonic()
+        output, _ = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    waited = time.monotonic() - killed_at
+    assert process.returncode != 0
+    assert f"ChildProcessError: Worker {worker} of the collector was killed by SIGKILL" in output
+    assert "resume=auto" in output
+    last = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert last.returncode == 0, last.stderr
+    assert "Resumed from" in last.stdout
+    steps = [int(row["step"]) for row in record(tmp_path)]
+    assert steps == sorted(set(steps))
+    with capsys.disabled():
+        print(
+            f"\n{name}, collector={kind}: a worker killed; the run ended with a message after "
+            f"{waited:.1f} s, and was resumed"
+        )

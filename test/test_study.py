@@ -258,11 +258,22 @@ def test_a_run_that_two_studies_ask_for_is_made_once_and_as_long_as_the_longer(
     assert len(starts(tmp_path / "runs")) == 1
 
 
-def test_with_more_steps_a_run_begins_anew(run, tmp_path, counter):
+@pytest.mark.parametrize("has_buffer", [False, True])
+def test_with_more_steps_a_run_goes_on_unless_it_has_left_out_a_buffer(
+    run, tmp_path, counter, has_buffer
+):
+    if has_buffer:
+        config = counter.parent / "config/config.yaml"
+        config.write_text(config.read_text() + "\nreplay_buffer: 1\n")
+        with_buffer = counter.read_text().replace(
+            '"seed": seed', '"replay_buffer": 1, "seed": seed'
+        )
+        counter.write_text(with_buffer)
     assert run(plan(tmp_path, counter, s={"seeds": "1"}))[0] == 0
     longer = plan(tmp_path, counter, s={"seeds": "1", "steps": 8})
     assert run(longer)[0] == 0
-    assert list(starts(tmp_path / "runs").values()) == [["auto", "null"]]
+    resumed = "null" if has_buffer else "auto"
+    assert list(starts(tmp_path / "runs").values()) == [["auto", resumed]]
     # A shorter one is part of it.
     assert "is done" in run(plan(tmp_path, counter, s={"seeds": "1"}))[1]
 

@@ -6,25 +6,47 @@ trajectories together; the environment has the batch size `[*B, K]` with `prod(B
 
 from __future__ import annotations
 
+import inspect
+import signal
+import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence, Set
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing.connection import wait
 from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor, nn
-from torchrl.collectors import Collector, MultiAsyncCollector, MultiCollector, MultiSyncCollector
+from torchrl.collectors import (
+    BaseCollector,
+    Collector,
+    MultiAsyncCollector,
+    MultiCollector,
+    MultiSyncCollector,
+)
+from torchrl.collectors.distributed import RayCollector
 from torchrl.collectors.utils import _maybe_normalize_replay_buffer_tensordict_device
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import RandomPolicy
 
+try:
+    import ray
+except ImportError:  # an extra, which TorchRL asks for in its own words
+    ray: Any = None
+
 from torchrl_ecpo.data import GROUP_KEY, MASK_KEY, TRAJECTORY_KEY, pack_groups, unpack_groups
 
-__all__ = ["TrajectoryGroupCollector"]
+__all__ = [
+    "SupervisedAsyncCollector",
+    "SupervisedSyncCollector",
+    "TrajectoryGroupCollector",
+    "shut_down",
+]
 
 _DONE_NAMES = ("done", "terminated", "truncated")
 
@@ -54,6 +76,7 @@ class _GroupCollectorMeta(type(Collector)):
         cls,
         *args: Any,
         backend: str | None = None,
+        backend_options: dict[str, Any] | None = None,
         num_collectors: int | None = None,
         sync: bool | None = None,
         **kwargs: Any,
@@ -61,18 +84,27 @@ class _GroupCollectorMeta(type(Collector)):
         several = isinstance(args[0] if args else kwargs.get("create_env_fn"), Sequence)
         if backend is None:
             backend = "process" if several or num_collectors is not None else "direct"
-        if backend == "process":
-            return _make_multi_collector(*args, num_collectors=num_collectors, sync=sync, **kwargs)
-        if backend != "direct":
+        if backend not in ("direct", "process", "ray"):
             raise ValueError(
-                f"backend={backend!r} does not collect groups; 'direct' and 'process' do."
+                f"backend={backend!r} does not collect groups; 'direct', 'process' and 'ray' do."
             )
-        if several or num_collectors is not None or sync is not None:
-            raise ValueError(
-                "sync, num_collectors and lists of environment makers are for worker processes: "
-                "sync needs num_collectors, the number of workers."
-            )
-        return super().__call__(*args, **kwargs)
+        if backend_options is not None and backend != "ray":
+            raise ValueError(f"backend_options are for backend='ray', got them for {backend!r}.")
+        if backend == "direct":
+            if several or num_collectors is not None or sync is not None:
+                raise ValueError(
+                    "sync, num_collectors and lists of environment makers are for worker "
+                    "processes: sync needs num_collectors, the number of workers."
+                )
+            return super().__call__(*args, **kwargs)
+        if backend == "ray" and sync is False:
+            raise ValueError("sync=False is for backend='process': with Ray, workers wait.")
+        make: Any = _SyncGroups if sync else _AsyncGroups
+        if backend == "ray":
+            make, sync = partial(_RayGroups, **(backend_options or {})), True
+        return _make_multi_collector(
+            make, *args, num_collectors=num_collectors, is_sync=bool(sync), **kwargs
+        )
 
 
 class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
@@ -81,7 +113,8 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
     Takes what TorchRL's ``Collector`` takes, except what would cut trajectories, and:
 
     - yields batches `[G, K, T]` padded to the longest trajectory, with ``("collector", "mask")``,
-      or, given a `replay_buffer`, writes their steps flat, for :class:`TrajectoryGroupSampler`;
+      or, given a `replay_buffer`, writes their steps flat, for
+      :class:`~torchrl_ecpo.data.TrajectoryGroupSampler`;
     - is on-policy by the letter of Algorithm 1: all trajectories of a batch come from the same
       weights. The collector samples from a copy of the policy, the reference, which changes only
       when :meth:`update_policy_weights_` is called, on every backend. If that happens within a
@@ -103,8 +136,10 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
         policy: what acts. Default: random actions.
         num_groups: `G`, a multiple of the environment's `prod(B)` (of all workers', with `sync`).
         group_size: `K`, at least 2.
-        backend: ``"direct"``, in this process, or ``"process"``, in worker processes. Default: the
-            latter if workers are asked for.
+        backend: ``"direct"``, in this process, ``"process"``, in worker processes, or ``"ray"``, in
+            the actors of a Ray cluster. Default: worker processes if they are asked for.
+        backend_options: for Ray, TorchRL's `ray_init_config` (what ``ray.init`` takes) and
+            `remote_configs` (what an actor needs, as ``ray.remote`` takes it).
         num_collectors: run this many worker processes. Default: none, or one for each of a list
             of makers.
         sync: with workers, whether a batch is made of all workers' groups, collected at the same
@@ -128,6 +163,7 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
             environment makes groups of another size.
         KeyError: if the environment has no `group_key`.
         RuntimeError: if a trajectory does not end within `max_steps`.
+        ChildProcessError: if a worker process dies.
 
     Examples:
         >>> from torchrl.envs import GymEnv
@@ -151,6 +187,7 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
         num_groups: int,
         group_size: int,
         backend: str | None = None,
+        backend_options: dict[str, Any] | None = None,
         num_collectors: int | None = None,
         sync: bool | None = None,
         total_frames: int = -1,
@@ -161,7 +198,7 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
         **kwargs: Any,
     ) -> None:
         """Make the collector; the class describes the arguments."""
-        del backend, num_collectors, sync  # the metaclass has read them
+        del backend, backend_options, num_collectors, sync  # the metaclass has read them
         _check_arguments(num_groups, group_size, kwargs)
         self.num_groups, self.group_size = num_groups, group_size
         self.exclude_keys = set(map(unravel_key, exclude_keys))
@@ -567,6 +604,147 @@ def _check_arguments(num_groups: int, group_size: int, options: dict[str, Any]) 
             raise TypeError(f"TrajectoryGroupCollector does not take {name}: {_REFUSED[name]}.")
 
 
+class _WorkerDied(BaseException):
+    """Passes through what catches errors while it waits for a worker."""
+
+
+class _Supervised(MultiCollector):
+    """Ends with a clear error when a worker process dies.
+
+    TorchRL looks after its workers from time to time. Yet it may wait for ever for what a dead one
+    was about to send, such as the acknowledgement of new weights.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        kwargs.setdefault("init_fn", _leave_interrupts_to_the_run)
+        super().__init__(*args, **kwargs)
+
+    def iterator(self) -> Iterator[TensorDictBase | None]:
+        """Yield batches.
+
+        Raises:
+            ChildProcessError: if a worker has died.
+        """
+        batches = super().iterator()  # pyright: ignore[reportAbstractUsage]
+        while True:
+            with self._watch():
+                try:
+                    batch = next(batches)
+                except StopIteration:
+                    return
+            yield batch
+
+    def update_policy_weights_(self, *args: Any, **kwargs: Any) -> None:
+        """Send the weights of the policy, or those given, to the workers.
+
+        Raises:
+            ChildProcessError: if a worker has died.
+        """
+        with self._watch():
+            super().update_policy_weights_(*args, **kwargs)
+
+    @contextmanager
+    def _watch(self) -> Iterator[None]:
+        """Within, the death of a worker is an error at once."""
+        try:
+            with _call_when_a_child_ends(self._stop_waiting):
+                self._stop_waiting()
+                yield
+        except (_WorkerDied, Exception) as error:
+            # A worker's connections end before itself.
+            running = {proc.sentinel: proc for proc in self.procs if not proc._closed}
+            for ended in wait(list(running), timeout=5.0):
+                running[ended].join()
+            dead = self._find_dead()
+            if dead is None:
+                raise
+            for process in running.values():
+                process.kill()
+            worker, code = dead
+            raise ChildProcessError(_describe_death(worker, _describe_exit(code))) from error
+
+    def _stop_waiting(self, *_: Any) -> None:
+        if self._find_dead() is not None:
+            raise _WorkerDied
+
+    def _find_dead(self) -> tuple[int, int] | None:
+        """The first worker that has ended, and its exit code."""
+        for worker, process in enumerate(self.procs):
+            if not process._closed and process.exitcode is not None:
+                return worker, process.exitcode
+        return None
+
+
+@contextmanager
+def _call_when_a_child_ends(handle: Callable[..., None]) -> Iterator[None]:
+    """Within, `handle` interrupts whatever this process waits for when a child process ends.
+
+    The system tells so by a signal, which the main thread gets; elsewhere nothing is called.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous = signal.signal(signal.SIGCHLD, handle)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGCHLD, previous or signal.SIG_DFL)
+
+
+def _leave_interrupts_to_the_run() -> None:
+    """Ctrl-C reaches all processes of a terminal; the run's own tells the workers when to end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _describe_exit(code: int) -> str:
+    if code >= 0:
+        return f"ended with exit code {code}: its own error is printed above"
+    hint = ", as the system does when memory runs out" if code == -signal.SIGKILL else ""
+    return f"was killed by {signal.Signals(-code).name}{hint}"
+
+
+def _describe_death(worker: int, cause: str) -> str:
+    return (
+        f"Worker {worker} of the collector {cause}. The run cannot go on without it; start the run "
+        "again with resume=<run directory> or resume=auto to go on from its last checkpoint."
+    )
+
+
+@contextmanager
+def shut_down(collector: BaseCollector) -> Iterator[None]:
+    """End a collector however the block ends: its workers would keep the process alive.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> collector = Collector(GymEnv("Pendulum-v1"), frames_per_batch=2, total_frames=2)
+        >>> with shut_down(collector):
+        ...     next(iter(collector)).shape
+        torch.Size([2])
+    """
+    try:
+        yield
+    finally:
+        collector.shutdown()
+
+
+class SupervisedSyncCollector(_Supervised, MultiSyncCollector):
+    """TorchRL's ``MultiSyncCollector``; the death of a worker is a ``ChildProcessError`` at once.
+
+    Examples:
+        >>> issubclass(SupervisedSyncCollector, MultiSyncCollector)
+        True
+    """
+
+
+class SupervisedAsyncCollector(_Supervised, MultiAsyncCollector):
+    """TorchRL's ``MultiAsyncCollector``; the death of a worker is a ``ChildProcessError`` at once.
+
+    Examples:
+        >>> issubclass(SupervisedAsyncCollector, MultiAsyncCollector)
+        True
+    """
+
+
 class _Worker:
     """Makes the collector of a worker process, which hands over its batches flat."""
 
@@ -638,23 +816,114 @@ class _GroupsOfWorkers(MultiCollector):
             yield batch if self._process is None else self._process(batch)
 
 
-class _SyncGroups(_GroupsOfWorkers, MultiSyncCollector):
+class _SyncGroups(_GroupsOfWorkers, SupervisedSyncCollector):
     """All workers' groups in one batch."""
 
     def _flatten(self, steps: TensorDictBase) -> Any:
         return TensorDict.cat(steps.unbind(0))  # one entry for each worker
 
 
-class _AsyncGroups(_GroupsOfWorkers, MultiAsyncCollector):
+class _AsyncGroups(_GroupsOfWorkers, SupervisedAsyncCollector):
     """One worker's groups in each batch."""
 
 
+class _RayWorker(TrajectoryGroupCollector):
+    """The collector of a Ray actor, which hands over its batches flat."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        kwargs = {key: value for key, value in kwargs.items() if key not in _REFUSED}
+        super().__init__(*args, **kwargs)
+        self._yield_flat = True
+
+    def __repr__(self) -> str:
+        """Ray writes it before each line that an actor prints."""
+        return f"worker {self.worker_idx}"
+
+
+class _RayGroups(RayCollector):
+    """All actors' groups in one batch.
+
+    An actor does one thing after another, so that its weights never change within a batch.
+    """
+
+    def __init__(
+        self,
+        create_env_fn: Sequence[Callable[[], EnvBase]],
+        policy: Any,
+        *,
+        num_groups: int,
+        options: dict[str, Any],
+        total_frames: int,
+        **kwargs: Any,
+    ) -> None:
+        """Start the actors, each for groups of `num_groups`."""
+        if kwargs.get("replay_buffer") is not None:
+            raise TypeError("backend='ray' does not write to a replay_buffer: extend it yourself.")
+        taken = inspect.signature(RayCollector.__init__).parameters
+        passed_on = {key: kwargs.pop(key) for key in list(kwargs) if key not in taken}
+        self._pack = partial(
+            pack_groups, group_size=options["group_size"], group_key=options["group_key"]
+        )
+        super().__init__(
+            list(create_env_fn),
+            policy,
+            frames_per_batch=len(create_env_fn),
+            total_frames=total_frames,
+            sync=True,
+            collector_class=_RayWorker,
+            # TorchRL writes into the dictionaries: one for each actor.
+            collector_kwargs=[
+                {"num_groups": num_groups, **options, **passed_on} for _ in create_env_fn
+            ],
+            **kwargs,
+        )
+
+    restarted_trajectories = 0
+
+    def update_policy_weights_(self, *args: Any, **kwargs: Any) -> None:
+        """Send the weights of the policy, or those given, to the actors.
+
+        Raises:
+            ChildProcessError: if an actor has died.
+        """
+        with self._watch():
+            super().update_policy_weights_(*args, **kwargs)
+
+    def _sync_iterator(self) -> Iterator[TensorDictBase]:
+        """Yield batches; their parts differ in length, which TorchRL's own cannot stack."""
+        while not 0 <= self.total_frames <= self.collected_frames:
+            with self._watch():
+                tasks = [actor.next.remote() for actor in self.remote_collectors]
+                parts = ray.get(tasks)
+            for worker, part in enumerate(parts):  # each counts its trajectories for itself
+                part.set(TRAJECTORY_KEY, part[TRAJECTORY_KEY] * len(parts) + worker)
+            steps: Any = TensorDict.cat(parts)
+            groups = self._pack(steps)
+            self.collected_frames += int(groups[MASK_KEY].sum())
+            yield groups
+
+    @contextmanager
+    def _watch(self) -> Iterator[None]:
+        """Within, the death of an actor is an error that says what to do."""
+        try:
+            yield
+        except (RuntimeError, ray.exceptions.RayActorError):
+            for worker, actor in enumerate(self.remote_collectors):
+                try:
+                    ray.get(actor.__ray_ready__.remote(), timeout=10.0)
+                except ray.exceptions.RayActorError as dead:
+                    died = _describe_death(worker, "died in the Ray cluster")
+                    raise ChildProcessError(died) from dead
+            raise
+
+
 def _make_multi_collector(
+    make: Callable[..., Any],
     create_env_fn: Callable[[], EnvBase] | Sequence[Callable[[], EnvBase]],
     policy: Any = None,
     *,
     num_collectors: int | None,
-    sync: bool | None,
+    is_sync: bool,
     num_groups: int,
     group_size: int,
     total_frames: int = -1,
@@ -663,7 +932,7 @@ def _make_multi_collector(
     max_steps: int = 10_000,
     group_key: NestedKey = GROUP_KEY,
     **kwargs: Any,
-) -> _GroupsOfWorkers:
+) -> Any:
     _check_arguments(num_groups, group_size, kwargs)
     if not isinstance(create_env_fn, Sequence):
         create_env_fn = [create_env_fn] * (num_collectors or 1)
@@ -672,7 +941,7 @@ def _make_multi_collector(
         raise ValueError(
             f"num_collectors={num_collectors} does not match the {num_workers} environment makers."
         )
-    if sync and num_groups % num_workers:
+    if is_sync and num_groups % num_workers:
         raise ValueError(
             f"num_groups={num_groups} must be a multiple of the number of workers, {num_workers}."
         )
@@ -684,10 +953,10 @@ def _make_multi_collector(
         "group_key": group_key,
     }
     kwargs.setdefault("auto_register_policy_transforms", True)
-    return (_SyncGroups if sync else _AsyncGroups)(
+    return make(
         create_env_fn,
         policy,
-        num_groups=num_groups // num_workers if sync else num_groups,
+        num_groups=num_groups // num_workers if is_sync else num_groups,
         options=options,
         total_frames=total_frames,
         **kwargs,

@@ -73,16 +73,21 @@ class Run:
     def command(self) -> list[str]:
         """What makes the run, or goes on with it.
 
-        A run that was to be shorter begins anew: when it finished it left out its replay buffer.
+        When a run finished it left out its replay buffer; with one, a longer run begins anew.
         """
         record = find_record(self.directory)
-        is_shorter = record is not None and record.total < self.cell.steps
+        is_over = (
+            record is not None
+            and record.finished
+            and record.total < self.cell.steps
+            and "replay_buffer" in record.config
+        )
         steps = self.cell.steps if record is None else max(record.total, self.cell.steps)
         return [
             *(sys.executable, str(self.cell.script), *self.cell.options, f"seed={self.seed}"),
             f"{self.cell.total_option}={steps}",
             f"hydra.run.dir='{self.directory}'",
-            f"resume={'null' if is_shorter else 'auto'}",
+            f"resume={'null' if is_over else 'auto'}",
         ]
 
 

@@ -153,7 +153,13 @@ class Checkpoints:
         metadata = Checkpoint.manifest(source)["metadata"]
         names = set(self.checkpoint.components)
         if metadata["finished"]:
-            names -= ONLY_TO_GO_ON
+            left_out = names & ONLY_TO_GO_ON
+            names -= left_out
+            if left_out and metadata["step"] < self.config[f"total_{self.run.unit}"]:
+                raise CheckpointError(
+                    f"{source} is that of a run which had finished, and has no "
+                    f"{', '.join(left_out)}: begin a longer run anew, without resume."
+                )
         try:
             # What is rebuilt may draw random numbers, so their generators come last.
             self.checkpoint.load(source, components=names - {"random"})
@@ -259,14 +265,14 @@ class Checkpoints:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Write a last checkpoint: at the end, and if a loss refused numbers that are not finite.
+        """Write a last checkpoint: at the end, if a worker died, and if a loss was not finite.
 
-        The losses are asked before the parameters change, so that the state is still good.
+        All three are noticed before the parameters change, so that the state is still good.
         """
         self._restore_handlers()
         if error is None:
             self.save(finished=True)
-        elif isinstance(error, (FloatingPointError, ValueError)):
+        elif isinstance(error, (ChildProcessError, FloatingPointError, ValueError)):
             try:
                 self.save()
             except (FloatingPointError, CheckpointError) as refused:
@@ -308,7 +314,10 @@ def _check_options(options: DictConfig) -> None:
 
 
 def _differences(saved: dict[str, Any], present: dict[str, Any]) -> list[str]:
-    """What differs between two configurations, but for `FREE_OPTIONS`."""
+    """What differs between two configurations, but for `FREE_OPTIONS` and a total that has grown.
+
+    Nothing in a run depends on how long it is to be.
+    """
     old, new = (
         flatten({name: value for name, value in config.items() if name not in FREE_OPTIONS})
         for config in (saved, present)
@@ -317,4 +326,5 @@ def _differences(saved: dict[str, Any], present: dict[str, Any]) -> list[str]:
         f"{name} was {old.get(name, 'absent')}, is {new.get(name, 'absent')}"
         for name in sorted(old.keys() | new.keys())
         if name not in old or name not in new or old[name] != new[name]
+        if not (name.startswith("total_") and old[name] < new[name])
     ]

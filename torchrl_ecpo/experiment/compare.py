@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,6 +117,11 @@ def _method(run: Path, by: Sequence[str]) -> str:
     return ", ".join([first, *(f"{e} {v}" for e, v in zip(by[1:], others, strict=True))])
 
 
+def _is_unfinished(run: Path) -> bool:
+    summary = run / "summary.json"  # which a run that was killed has not written
+    return not summary.is_file() or not json.loads(summary.read_text())["finished"]
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table of a comparison, and where its picture is."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -131,14 +137,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--output", type=Path, help="picture; by default beside the runs")
     parser.add_argument("--csv", type=Path, help="also write the curves as a csv table")
     options = parser.parse_args(arguments)
+    runs = find_runs(options.directories)
     comparison = load_comparison(
-        find_runs(options.directories),
+        runs,
         options.metric,
         by=options.by,
         smoothing=options.smoothing,
         points=options.points,
     )
     print(comparison.table())
+    for run in filter(_is_unfinished, runs):
+        print(f"not finished, and curves are as long as the shortest one: {run}")
     if options.csv is not None:
         print(f"curves: {comparison.write(options.csv).resolve()}")
     picture = plot_comparison(

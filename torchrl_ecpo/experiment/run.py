@@ -140,6 +140,7 @@ class Run:
         name: of the run, in titles and loggers.
         shown: metrics that the progress bar shows, and the picture, a panel each.
         directory: where to write; defaults to the working directory.
+        show_bar: whether there is a progress bar; default True.
 
     Raises:
         ValueError: for an unknown backend.
@@ -154,6 +155,7 @@ class Run:
         name: str,
         shown: Sequence[str],
         directory: Path | str = ".",
+        show_bar: bool = True,
     ) -> None:
         backend = config.logger.backend or "none"
         if backend not in BACKENDS:
@@ -170,6 +172,7 @@ class Run:
             total=total,
             unit=f" {unit}",
             desc=name,
+            disable=not show_bar,
             # A log file gets a line now and then, a terminal a lively bar.
             mininterval=0.5 if sys.stderr.isatty() else 30.0,
         )
