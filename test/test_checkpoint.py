@@ -60,7 +60,7 @@ def start(monkeypatch):
     monkeypatch.setattr("torchrl_ecpo.experiment.run.plot_learning_curve", lambda *_, **__: "")
 
     def start(directory, script, *options, stop_at=None, kill_at=None, save_at=None):
-        for name in ("utils", "tasks", "score_sac", script):
+        for name in ("utils", "tasks", "stack", "score_sac", script):
             sys.modules.pop(name, None)
         monkeypatch.syspath_prepend(str(SCRIPTS / script))
         main = importlib.import_module(script).main
@@ -86,7 +86,7 @@ def start(monkeypatch):
             main.__wrapped__(config)
 
     yield start
-    for name in ("utils", "tasks", "score_sac", "ecpo", "ecac"):
+    for name in ("utils", "tasks", "stack", "score_sac", "ecpo", "ecac"):
         sys.modules.pop(name, None)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from torchrl_ecpo.experiment import read_metrics
+from torchrl_ecpo.experiment import compare, read_metrics
 
 ROOT = Path(__file__).parents[1]
 ECPO = ROOT / "sota-implementations/ecpo/ecpo.py"
@@ -84,10 +85,35 @@ def test_seeds_are_other_problems_and_schedules_and_ablations_are_options(sweep,
     assert set(without_entropy["kl_to_reference"]) == {0}, "one step a lift: no projection"
 
 
+def test_a_sweep_over_two_processes_gives_the_metrics_of_single_runs(sweep, tmp_path):
+    run_ecpo(
+        tmp_path,
+        "--multirun",
+        "hydra/launcher=joblib",
+        "hydra.launcher.n_jobs=2",
+        "loss=ecpo,ment",
+        "seed=5",
+        "project_steps=3",
+        f"hydra.sweep.dir={tmp_path}",
+        "hydra.sweep.subdir=${loss.name}",
+    )
+    for loss in ("ecpo", "ment"):
+        assert read_metrics(tmp_path / loss) == read_metrics(sweep / loss)
+
+
 @pytest.mark.parametrize(
     "options",
     [
         ("env=copy", "total_trajectories=40", "num_groups=2", "evaluation_interval=1"),
+        ("env=copy", "total_trajectories=80", "num_groups=2", "collector=multi_sync"),
+        pytest.param(
+            ("env=gym", "total_trajectories=64", "env.max_steps=5", "collector=multi_async"),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            ("env=gym", "total_trajectories=64", "env.max_steps=5", "collector=ray"),
+            marks=pytest.mark.slow,
+        ),
         (
             "env=reversed_addition",
             "loss=urex",
@@ -117,6 +143,17 @@ def test_compare_from_the_command_line(sweep):
     process = subprocess.run(command, capture_output=True, text=True, check=False)
     assert "| ecpo | 1 | 60 |" in process.stdout, process.stderr
     assert (sweep / "comparison.png").exists()
+    assert "not finished" not in process.stdout
+
+
+def test_compare_names_runs_that_have_not_finished(sweep, tmp_path, capsys):
+    for loss in ("ecpo", "ment", "urex"):
+        shutil.copytree(sweep / loss, tmp_path / loss)
+    (tmp_path / "ment/summary.json").write_text('{"finished": false}')
+    (tmp_path / "urex/summary.json").unlink()
+    compare.main([str(tmp_path), "--metric", "expected_reward"])
+    named = [line for line in capsys.readouterr().out.splitlines() if "not finished" in line]
+    assert [Path(line.split()[-1]).name for line in named] == ["ment", "urex"]
 
 
 @pytest.mark.slow  # two to five minutes
@@ -134,6 +171,7 @@ def test_groups_of_eight_learn_cartpole(tmp_path):
         (["anneal_from={metric:foo,at_least:1}"], "anneal_from.metric must be one of"),
         (["loss.tau=-1"], "tau must be a finite number >= 0, got -1"),
         (["group_size=1"], "group_size of at least 2, got num_groups=1, group_size=1"),
+        (["collector=multi_sync"], "num_groups=1 must be a multiple of the number of workers, 2"),
     ],
 )
 def test_bad_options_end_with_a_clear_message(tmp_path, overrides, message):

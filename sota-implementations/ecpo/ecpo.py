@@ -1,6 +1,7 @@
 """Train ECPO, PMD, UREX or MENT on groups of trajectories: Algorithm 1 and its baselines.
 
-``python ecpo.py env=bandit loss=ecpo seed=1``; every option is in ``config/``.
+``python ecpo.py env=bandit loss=ecpo seed=1``; every option is in ``config/``. ``seeds=[0,1,2]``
+trains as many independent runs in one process (``stack.py``).
 """
 
 from __future__ import annotations
@@ -8,17 +9,11 @@ from __future__ import annotations
 import hydra
 import torch
 from omegaconf import DictConfig
-from tasks import make_task
-from utils import (
-    check_config,
-    make_collector,
-    make_loss,
-    make_optimizer,
-    make_temperatures,
-    reached,
-)
+from stack import make_stack
+from utils import check_config, is_single, make_optimizer, make_parts, reached
 
-from torchrl_ecpo.experiment import Checkpoints, Progress, Run
+from torchrl_ecpo.collectors import shut_down
+from torchrl_ecpo.experiment import Checkpoints, Progress
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
@@ -26,25 +21,16 @@ def main(config: DictConfig) -> None:
     check_config(config)
     checkpoints = Checkpoints(config)
     torch.set_num_threads(config.threads)
-    torch.manual_seed(config.seed)
 
-    task = make_task(config)
-    collector = make_collector(config, task)
-    loss_module = make_loss(config.loss, task.actor)
-    temperatures = make_temperatures(config.loss, loss_module)
+    parts = make_parts(config) if config.seeds is None else make_stack(config)
+    task, collector, loss_module, temperatures, run, clip_grad_norm_ = parts
     optimizer = make_optimizer(config.optim, loss_module)
     max_grad_norm = config.optim.max_grad_norm or float("inf")
 
     groups_of_trajectories = iter(collector)
     progress = Progress(trajectories=0, project_steps=0, is_annealing=config.anneal_from is None)
-    run = Run(
-        config,
-        total=config.total_trajectories,
-        unit="trajectories",
-        name=f"{config.env.name}/{config.loss.name}/seed_{config.seed}",
-        shown=task.shown,
-    )
     with (
+        shut_down(collector),
         run,
         checkpoints.attach(
             run,
@@ -52,7 +38,7 @@ def main(config: DictConfig) -> None:
             loss_module=loss_module,
             optimizer=optimizer,
             temperatures=temperatures,
-            collector=collector,
+            collector=collector if is_single(config) else None,
             evaluation_env=task.evaluation_env,
         ),
     ):
@@ -65,8 +51,8 @@ def main(config: DictConfig) -> None:
                 groups = next(groups_of_trajectories)
                 losses = loss_module(groups)
                 optimizer.zero_grad()
-                losses["loss_actor"].backward()
-                grad_norm = torch.nn.utils.clip_grad_norm_(loss_module.parameters(), max_grad_norm)
+                losses["loss_actor"].sum().backward()  # of stacked runs there is one each
+                grad_norm = clip_grad_norm_(max_grad_norm)
                 metrics = {**losses.detach(), "grad_norm": grad_norm}
                 run.check(metrics, progress.trajectories)
                 optimizer.step()
@@ -77,11 +63,9 @@ def main(config: DictConfig) -> None:
                 if progress.project_steps % config.evaluation_interval == 0:
                     metrics |= task.evaluate(groups)
                 run.log(metrics, step=progress.trajectories)
-            progress.is_annealing = progress.is_annealing or reached(config.anneal_from, metrics)
-            if progress.is_annealing:
-                temperatures.step(progress.trajectories - lifted_at)
+            progress.is_annealing |= reached(config.anneal_from, metrics)
+            temperatures.step(progress.is_annealing * (progress.trajectories - lifted_at))
             checkpoints.boundary()
-    collector.shutdown()
 
 
 if __name__ == "__main__":

@@ -49,6 +49,8 @@ class Task:
 
     env: EnvBase
     """Of batch size ``[num_groups, group_size]``."""
+    make_env: Callable[..., EnvBase]
+    """Makes another one, with its own ``num_groups``, in a worker process."""
     actor: ProbabilisticTensorDictSequential
     measure: Callable[[TensorDictBase], Metrics]
     """What a batch of groups ``[num_groups, group_size, T]`` tells beside the loss."""
@@ -68,14 +70,15 @@ def make_task(config: DictConfig) -> Task:
 
 def make_bandit(config: DictConfig) -> Task:
     """The synthetic bandit; its one-layer policy is known exactly, so nothing need be sampled."""
-    env = BanditEnv(
+    make_env = partial(
+        BanditEnv,
         num_actions=config.env.num_actions,
         num_features=config.env.num_features,
         exponent=config.env.exponent,
         instance_seed=config.env.instance_seed,
-        num_groups=config.num_groups,
         group_size=config.group_size,
     )
+    env = make_env(num_groups=config.num_groups)
     actor = make_softmax_policy(env.features)
     state = TensorDict({"observation": torch.ones(1)})
 
@@ -85,17 +88,19 @@ def make_bandit(config: DictConfig) -> Task:
         assert isinstance(distribution, SharedCategorical)
         return {"expected_reward": env.expected_reward(distribution.probs)}
 
-    return Task(env, actor, measure, lambda groups: {}, ("expected_reward", "entropy", "ESS"))
+    shown = ("expected_reward", "entropy", "ESS")
+    return Task(env, make_env, actor, measure, lambda groups: {}, shown)
 
 
 def make_algorithmic(config: DictConfig) -> Task:
     """A task of gym's algorithmic suite, with the recurrent tuple policy."""
-    make_env = partial(AlgorithmicEnv, config.env.name)
-    env = make_env(
-        num_groups=config.num_groups,
+    make_env = partial(
+        AlgorithmicEnv,
+        config.env.name,
         group_size=config.group_size,
         curriculum=config.env.curriculum,
     )
+    env = make_env(num_groups=config.num_groups)
     action_spec: Any = env.action_spec
     actor = make_tuple_policy(
         num_observations=env.task.base + 1,
@@ -104,7 +109,7 @@ def make_algorithmic(config: DictConfig) -> Task:
         head=config.env.head,
         distinct_histories=config.env.distinct_histories,
     )
-    other = make_env(num_groups=EVALUATION_EPISODES, curriculum=None)
+    other = AlgorithmicEnv(config.env.name, num_groups=EVALUATION_EPISODES, curriculum=None)
     evaluation_env = TransformedEnv(other, get_env_transforms_from_module(actor))
     other.set_seed(config.seed + 1_000_000)
 
@@ -123,9 +128,8 @@ def make_algorithmic(config: DictConfig) -> Task:
             "greedy_attained": _returns(episodes).sum() / episodes["attainable"][..., 0].sum(),
         }
 
-    return Task(
-        env, actor, measure, evaluate, ("return", "level", "attained", "entropy", "ESS"), other
-    )
+    shown = ("return", "level", "attained", "entropy", "ESS")
+    return Task(env, make_env, actor, measure, evaluate, shown, other)
 
 
 def make_gym(config: DictConfig) -> Task:
@@ -141,9 +145,11 @@ def make_gym(config: DictConfig) -> Task:
         transforms: list[Any] = [DoubleToFloat(), StepCounter(config.env.max_steps)]
         return TransformedEnv(env, Compose(*transforms))
 
-    groups = GroupedEnv(make_copy, num_groups=config.num_groups, group_size=config.group_size)
+    def make_env(num_groups: int) -> EnvBase:
+        return limited(GroupedEnv(make_copy, num_groups=num_groups, group_size=config.group_size))
+
     copies = SerialEnv(10, make_evaluation_copy)
-    env, evaluation_env = limited(groups), limited(copies)
+    env, evaluation_env = make_env(config.num_groups), limited(copies)
     evaluation_env.set_seed(config.seed + 1_000_000)
     actor = make_mlp_policy(env, config.env.hidden_sizes)
 
@@ -153,9 +159,8 @@ def make_gym(config: DictConfig) -> Task:
     def evaluate(groups: TensorDictBase) -> Metrics:
         return {"greedy_return": _returns(_greedy(evaluation_env, actor)).mean()}
 
-    return Task(
-        env, actor, measure, evaluate, ("return", "greedy_return", "entropy", "ESS"), copies
-    )
+    shown = ("return", "greedy_return", "entropy", "ESS")
+    return Task(env, make_env, actor, measure, evaluate, shown, copies)
 
 
 def make_mlp_policy(env: EnvBase, hidden_sizes: Sequence[int]) -> ProbabilisticTensorDictSequential:

@@ -4,5 +4,14 @@ from torchrl_ecpo.envs.algorithmic import TASKS, AlgorithmicEnv, AlgorithmicTask
 from torchrl_ecpo.envs.bandit import BanditEnv
 from torchrl_ecpo.envs.grouped import GroupedEnv
 from torchrl_ecpo.envs.replay import EpisodeReplay
+from torchrl_ecpo.envs.stacked import stack_envs
 
-__all__ = ["TASKS", "AlgorithmicEnv", "AlgorithmicTask", "BanditEnv", "EpisodeReplay", "GroupedEnv"]
+__all__ = [
+    "TASKS",
+    "AlgorithmicEnv",
+    "AlgorithmicTask",
+    "BanditEnv",
+    "EpisodeReplay",
+    "GroupedEnv",
+    "stack_envs",
+]

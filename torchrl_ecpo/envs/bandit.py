@@ -103,13 +103,16 @@ class BanditEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"]
-        num_actions = self.rewards.shape[0]
+        num_actions = self.rewards.shape[-1]
         if bool(((action < 0) | (action >= num_actions)).any().item()):
             raise ValueError(
                 f"An action of the bandit must be an integer from 0 to {num_actions - 1}, got "
                 f"{action.min().item()} to {action.max().item()}."
             )
-        return self._output(done=True).set("reward", self.rewards[action].unsqueeze(-1))
+        return self._output(done=True).set("reward", self._reward(action).unsqueeze(-1))
+
+    def _reward(self, action: Tensor) -> Tensor:
+        return self.rewards[action]
 
     def _output(self, *, done: bool) -> TensorDict:
         one = (*self.batch_size, 1)

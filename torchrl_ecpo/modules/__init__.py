@@ -9,6 +9,7 @@ from torchrl_ecpo.modules.actor_critic import (
 )
 from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
 from torchrl_ecpo.modules.softmax import LinearSoftmax, SharedCategorical, make_softmax_policy
+from torchrl_ecpo.modules.stacked import stack_policies
 from torchrl_ecpo.modules.tuple_policy import TupleCategorical, make_tuple_policy
 
 __all__ = [
@@ -23,4 +24,5 @@ __all__ = [
     "make_tanh_gaussian_actor",
     "make_tuple_policy",
     "make_value_network",
+    "stack_policies",
 ]

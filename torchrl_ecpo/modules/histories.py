@@ -2,7 +2,8 @@
 
 Shapes: R rows at one step; N rows of T steps; n distinct histories ("nodes"); H hidden units. Nodes
 are ordered by step, so that the nodes of one step form a contiguous block, and a node's parent is
-the history that it extends by one step.
+the history that it extends by one step. Rows may belong to different runs of a stack, each with
+weights of its own: then they share no histories, and the nodes of a block are ordered by run.
 """
 
 from __future__ import annotations
@@ -63,6 +64,18 @@ def _multipliers(size: int, stream: int, device: torch.device) -> Tensor:
     return mix(torch.arange(size, device=device) + (stream << 32)) | 1
 
 
+class _Block(NamedTuple):
+    """The nodes of a step."""
+
+    nodes: slice
+    parents: Tensor | None
+    """None where all start from the zero state."""
+    continues: Tensor | None
+    """A bool column that is False for those that start from the zero state, None if none does."""
+    sizes: list[int] | None
+    """How many there are of each run; None without runs."""
+
+
 class Histories(NamedTuple):
     """The distinct histories of a batch `[N, T]`.
 
@@ -73,6 +86,7 @@ class Histories(NamedTuple):
             the first step: into the initial states); -1 for a node that starts from the zero state.
         rows: int64 `[n]`, one place of each node in the batch, flattened from `[T, N]`.
         nodes: int64 `[T, N]`, the node at each place of the batch; -1 at padded steps.
+        sizes: the number of nodes of each run at each step; None without runs.
     """
 
     counts: list[int]
@@ -80,24 +94,22 @@ class Histories(NamedTuple):
     parents: Tensor
     rows: Tensor
     nodes: Tensor
+    sizes: list[list[int]] | None = None
 
-    def blocks(self) -> list[tuple[slice, Tensor | None, Tensor | None]]:
-        """Cut the nodes into steps.
-
-        Returns:
-            For each step that has nodes: their slice, their parents (None where all start from the
-            zero state), and a bool column that is False for those that do (None where none does).
-        """
+    def blocks(self) -> list[_Block]:
+        """Cut the nodes into steps, those that have nodes."""
         blocks, first = [], 0
-        for count, starts in zip(self.counts, self.starts, strict=True):
+        sizes = self.sizes or [None] * len(self.counts)
+        for count, starts, size in zip(self.counts, self.starts, sizes, strict=True):
             block = slice(first, first + count)
             first += count
             if starts == count:
-                blocks.append((block, None, None))
+                blocks.append(_Block(block, None, None, size))
                 continue
             parent = self.parents[block]
             continues = (parent >= 0).unsqueeze(1) if starts else None
-            blocks.append((block, parent.clamp(min=0) if starts else parent, continues))
+            parent = parent.clamp(min=0) if starts else parent
+            blocks.append(_Block(block, parent, continues, size))
         return [block for count, block in zip(self.counts, blocks, strict=True) if count]
 
 
@@ -108,6 +120,8 @@ def distinct_histories(
     *,
     num_symbols: int,
     first_hashes: Tensor | None = None,
+    runs: Tensor | None = None,
+    num_runs: int = 1,
 ) -> Histories:
     """Find the distinct histories of a batch of sequences.
 
@@ -123,6 +137,8 @@ def distinct_histories(
         first_hashes: int64 `[N]`, the hash of the state that a row continues from where its first
             step is no start. Row i then continues from initial state i. None where every row starts
             at its first step.
+        runs: int64 `[N]` in [0, num_runs), the run that each row belongs to; None for one run.
+        num_runs: the number of runs.
 
     Returns:
         The histories.
@@ -140,8 +156,15 @@ def distinct_histories(
         keys = keys.masked_fill(~mask, _PADDING)
 
     keys, order = keys.sort(1)
+    if runs is not None:
+        # The sort by run is stable, so that a run's nodes are ordered as if it were alone.
+        by_run, within = runs[order].sort(dim=1, stable=True)
+        keys, order = keys.gather(1, within), order.gather(1, within)
+    differs = keys[:, 1:] != keys[:, :-1]
+    if runs is not None:
+        differs |= by_run[:, 1:] != by_run[:, :-1]
     new = keys != _PADDING
-    new[:, 1:] &= keys[:, 1:] != keys[:, :-1]
+    new[:, 1:] &= differs
     # Nodes are numbered within their step first, as parents are.
     nodes = torch.empty_like(order).scatter_(1, order, new.cumsum(1) - 1)
     if mask is not None:
@@ -154,7 +177,11 @@ def distinct_histories(
     started = torch.zeros_like(counts).index_add_(0, rows // num_rows, (parents < 0).long())
     first = (counts.cumsum(0) - counts).unsqueeze(1)
     nodes = torch.where(nodes < 0, nodes, nodes + first)
-    return Histories(counts.tolist(), started.tolist(), parents, rows, nodes)
+    sizes = None
+    if runs is not None:
+        place = rows // num_rows * num_runs + runs[rows % num_rows]
+        sizes = place.bincount(minlength=num_steps * num_runs).view(num_steps, -1).tolist()
+    return Histories(counts.tolist(), started.tolist(), parents, rows, nodes, sizes)
 
 
 class LSTMOverHistories(torch.autograd.Function):
@@ -167,8 +194,8 @@ class LSTMOverHistories(torch.autograd.Function):
 
     - projections `[S, 4H]`: the input's part of the gates for each symbol, biases included, in
       PyTorch's order (input, forget, cell, output);
-    - weight_hh `[4H, H]`; h_0, c_0 `[N, H]`: the initial states, None where every row starts from
-      zero;
+    - weight_hh `[4H, H]`, or one for each run, `[runs, 4H, H]`;
+    - h_0, c_0 `[N, H]`: the initial states, None where every row starts from zero;
     - symbols int64 `[n]`: the symbol that each node ends with, as a row of `projections`;
     - h, c `[n, H]`: the state after each node; gates `[n, 4H]`: activations, not differentiable.
     """
@@ -183,21 +210,25 @@ class LSTMOverHistories(torch.autograd.Function):
         histories: Histories,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Evaluate the cell step by step; see the class."""
-        hidden = weight_hh.shape[1]
+        hidden = weight_hh.shape[-1]
         # tanh(x) = 2 sigmoid(2x) - 1: doubling the cell gate's inputs lets one vectorised sigmoid
         # serve all gates, at a third of tanh's time.
         scale = weight_hh.new_ones(4, hidden)
         scale[2] = 2
         scale = scale.flatten()
         gates = (projections * scale).index_select(0, symbols)
-        weight = (weight_hh * scale.unsqueeze(1)).t()
+        weights = _of_runs((weight_hh * scale.unsqueeze(1)).mT)
         h, c = gates.new_empty(len(symbols), hidden), gates.new_empty(len(symbols), hidden)
         # The first step reads them only where it continues.
         before_h, before_c = cast(Tensor, h_0), cast(Tensor, c_0)
-        for block, parent, continues in histories.blocks():
+        for block, parent, continues, sizes in histories.blocks():
             gate = gates[block]
             if parent is not None:
-                gate.addmm_(_gather(before_h, parent, continues), weight)
+                past = _gather(before_h, parent, continues)
+                for own, *factors in zip(
+                    _parts(gate, sizes), _parts(past, sizes), weights, strict=True
+                ):
+                    own.addmm_(*factors)
             i, f, g, o = gate.sigmoid_().split(hidden, 1)
             g.mul_(2).sub_(1)
             before_h, last_c, before_c = h[block], before_c, c[block]
@@ -222,14 +253,15 @@ class LSTMOverHistories(torch.autograd.Function):
     def backward(ctx: Any, grad_h: Tensor | None, grad_c: Tensor | None, _: None) -> tuple:
         """Go back through the steps, each node's gradient flowing into its parent's."""
         weight, h_0, c_0, symbols, h, c, gates = ctx.saved_tensors
-        hidden = weight.shape[1]
+        hidden = weight.shape[-1]
         grad_projections = weight.new_zeros(ctx.num_symbols, 4 * hidden)
         grad_weight = torch.zeros_like(weight)
+        weights, grad_weights = _of_runs(weight), _of_runs(grad_weight)
         blocks = ctx.histories.blocks()
         grad_h = torch.zeros_like(h) if grad_h is None else grad_h
         child_h = child_c = None  # what flows in from the next step
         for index in reversed(range(len(blocks))):
-            block, parent, continues = blocks[index]
+            block, parent, continues, sizes = blocks[index]
             i, f, g, o = gates[block].split(hidden, 1)
             tanh_c = _tanh(c[block])
             dh = grad_h[block] if child_h is None else child_h.add_(grad_h[block])
@@ -253,11 +285,26 @@ class LSTMOverHistories(torch.autograd.Function):
                 else:
                     before_h, before_c = h_0, c_0
                 df.mul_(dc).mul_(_gather(before_c, parent, continues))
-                grad_weight.addmm_(grad.t(), _gather(before_h, parent, continues))
-                child_h = _scatter(grad @ weight, parent, continues, len(before_h))
+                past = _parts(_gather(before_h, parent, continues), sizes)
+                grads = _parts(grad, sizes)
+                for own, of_gates, of_past in zip(grad_weights, grads, past, strict=True):
+                    own.addmm_(of_gates.t(), of_past)
+                back = [own @ matrix for own, matrix in zip(grads, weights, strict=True)]
+                grad_past = back[0] if len(back) == 1 else torch.cat(back)
+                child_h = _scatter(grad_past, parent, continues, len(before_h))
                 child_c = _scatter(dc.mul_(f), parent, continues, len(before_h))
             grad_projections.index_add_(0, symbols[block], grad)
         return grad_projections, grad_weight, child_h, child_c, None, None
+
+
+def _of_runs(weight: Tensor) -> tuple[Tensor, ...]:
+    """The weight of each run, or the only one."""
+    return weight.unbind(0) if weight.ndim == 3 else (weight,)
+
+
+def _parts(x: Tensor, sizes: list[int] | None) -> tuple[Tensor, ...]:
+    """The rows of each run, or all of them."""
+    return (x,) if sizes is None else x.split(sizes)
 
 
 def _gather(states: Tensor, parent: Tensor, continues: Tensor | None) -> Tensor:

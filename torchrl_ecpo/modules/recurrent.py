@@ -16,7 +16,12 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import TensorDictPrimer
 from torchrl.modules import recurrent_mode
 
-from torchrl_ecpo.modules.histories import LSTMOverHistories, distinct_histories, hash_states
+from torchrl_ecpo.modules.histories import (
+    Histories,
+    LSTMOverHistories,
+    distinct_histories,
+    hash_states,
+)
 
 __all__ = ["DistinctHistoryLSTM"]
 
@@ -172,14 +177,10 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
         states: tuple[Tensor, Tensor] | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Of sequences `[T, N]`, the node at each place; each node's output, h and c `[n, *]`."""
-        histories = distinct_histories(
-            symbols,
-            starts,
-            mask,
-            num_symbols=self.num_symbols,
-            first_hashes=None if states is None else hash_states(*states),
-        )
-        present, node_symbols = symbols.flatten()[histories.rows].unique(return_inverse=True)
+        first_hashes = None if states is None else hash_states(*states)
+        histories = self._histories(symbols, starts, mask, first_hashes)
+        last_symbols = symbols.flatten()[histories.rows]
+        present, node_symbols = last_symbols.unique(return_inverse=True)
         lstm = LSTMOverHistories
         h, c, _ = (lstm.apply if torch.is_grad_enabled() else lstm.forward)(
             self._project(present),
@@ -188,13 +189,24 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
             node_symbols,
             histories,
         )
-        output = self.readout(h)
+        output = self._read_out(h, last_symbols)
         nodes = histories.nodes
         if mask is not None:
             # Node -1, the padding, is the last row.
             output = torch.cat([output, output.new_zeros(1, output.shape[-1])])
             nodes = nodes.masked_fill(nodes < 0, len(output) - 1)
         return nodes, output, h, c
+
+    def _histories(
+        self, symbols: Tensor, starts: Tensor, mask: Tensor | None, first_hashes: Tensor | None
+    ) -> Histories:
+        return distinct_histories(
+            symbols, starts, mask, num_symbols=self.num_symbols, first_hashes=first_hashes
+        )
+
+    def _read_out(self, h: Tensor, symbols: Tensor) -> Tensor:
+        """The output of each node, from its state `[n, H]` and last symbol `[n]`."""
+        return self.readout(h)
 
     def _symbols(self, tensordict: TensorDictBase) -> Tensor:
         """The input tuple as one number, int64 `[*B]`."""
@@ -217,10 +229,15 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
 
     def _project(self, symbols: Tensor) -> Tensor:
         """The input's part of the gates, `[S, 4H]`: a one-hot product is a sum of columns."""
-        sizes, weights, offsets, *_ = _radix(self.num_classes, symbols.device)
-        hot = symbols.unsqueeze(-1) // weights % sizes + offsets
-        columns = F.embedding_bag(hot, self.cell.weight_ih.t().contiguous(), mode="sum")
+        columns = F.embedding_bag(
+            self._hot(symbols), self.cell.weight_ih.t().contiguous(), mode="sum"
+        )
         return columns + (self.cell.bias_ih + self.cell.bias_hh)
+
+    def _hot(self, symbols: Tensor) -> Tensor:
+        """Where the one-hot vectors `[S, sum(num_classes)]` of symbols are 1."""
+        sizes, weights, offsets, *_ = _radix(self.num_classes, symbols.device)
+        return symbols.unsqueeze(-1) // weights % sizes + offsets
 
     def _states(self, tensordict: TensorDictBase, starts: Tensor) -> tuple[Tensor, Tensor] | None:
         """The states `[N, H]` that rows continue from; None where all start."""

@@ -130,8 +130,19 @@ class TupleCategorical(Distribution):
         uniform = torch.rand(
             (*sample_shape, *logits.shape), dtype=logits.dtype, device=logits.device
         )
+        return self.choose(uniform)
+
+    def choose(self, uniform: Tensor) -> Tensor:
+        """Draw actions with given randomness.
+
+        Args:
+            uniform: drawn uniformly from [0, 1), `[*sample_shape, *B, L]`; overwritten.
+
+        Returns:
+            int64 `[*sample_shape, *B, 3]`.
+        """
         gumbel = uniform.log_().neg_().log_()  # its negative
-        return self._decode(self._factors(logits - gumbel).argmax(-1))
+        return self._decode(self._factors(self.logits.detach() - gumbel).argmax(-1))
 
     def sample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
         """Draw actions and give their log-probabilities; there is no need to check their range.

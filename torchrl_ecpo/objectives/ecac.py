@@ -51,7 +51,7 @@ class ECACLoss(ContinuousActorCriticLoss):
     Keyword Args:
         tau: temperature of the divergence from the reference, in the unit of Q. Where it is
             learned, where it starts. Default: 0.3.
-        tau_prime: temperature of the entropy, likewise. Default: 0.1.
+        tau_prime: temperature of the entropy, likewise. Default: 1, as SAC's alpha.
         target_kl: KL(target, pi_bar) per action dimension, in nats, that tau is learned to hold
             (``loss_tau``, parameter ``log_tau``). It must be below log M / A. None: tau is
             fixed, or scheduled by assignment. Default: 0.083, half a nat for six dimensions.
@@ -141,7 +141,7 @@ class ECACLoss(ContinuousActorCriticLoss):
         value_network: TensorDictModule | None = None,
         *,
         tau: float = 0.3,
-        tau_prime: float = 0.1,
+        tau_prime: float = 1.0,
         target_kl: float | None = 0.083,
         target_entropy: float | Literal["auto"] | None = "auto",
         min_tau: float = 0.001,

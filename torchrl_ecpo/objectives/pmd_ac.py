@@ -42,7 +42,7 @@ class PMDACLoss(ContinuousActorCriticLoss):
         tau: temperature of the divergence from the reference, in the unit of Q. It has an effect
             with ``delay_actor=True`` only: a policy does not differ from itself. Default: 0.1.
         tau_prime: temperature of the entropy, in the unit of Q; where it is learned, where it
-            starts. Default: 0.1.
+            starts. Default: 1, as ECAC's.
         target_kl: as for :class:`~torchrl_ecpo.ECACLoss`; needs several ``num_action_samples``.
             Default: None, a fixed tau.
         target_entropy: as for :class:`~torchrl_ecpo.ECACLoss`. Default: ``"auto"``.
@@ -101,7 +101,7 @@ class PMDACLoss(ContinuousActorCriticLoss):
         value_network: TensorDictModule | None = None,
         *,
         tau: float = 0.1,
-        tau_prime: float = 0.1,
+        tau_prime: float = 1.0,
         target_kl: float | None = None,
         target_entropy: float | Literal["auto"] | None = "auto",
         min_tau: float = 0.001,
