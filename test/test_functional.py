@@ -1153,6 +1153,7 @@ def test_urex_needs_a_temperature_and_ment_does_not():
 
 
 def test_check_temperatures():
+    check_temperatures()  # a loss may have none
     check_temperatures(tau=0.0, tau_prime=1e-300)
     check_temperatures(allow_zero=True, tau=0.0, tau_prime=0.0)
     check_temperatures(tau=torch.tensor(-1.0), tau_prime=0.0)  # tensors are not looked at

@@ -77,8 +77,8 @@ def check_temperatures(*, allow_zero: bool = False, **temperatures: float | Tens
 
     Args:
         allow_zero: whether all may be 0 together.
-        temperatures: by name; each must be finite and at least 0, and they must not all be 0.
-            Tensors are not looked at.
+        temperatures: by name; each must be finite and at least 0, and, where there are any, one
+            above 0. Tensors are not looked at.
 
     Raises:
         ValueError: naming the temperature, what came, and the mend.
@@ -94,7 +94,8 @@ def check_temperatures(*, allow_zero: bool = False, **temperatures: float | Tens
     for name, value in floats.items():
         if not 0 <= value < math.inf:
             raise ValueError(f"{name} must be a finite number >= 0, got {value}.")
-    if not allow_zero and len(floats) == len(temperatures) and not any(floats.values()):
+    none_is_positive = len(floats) == len(temperatures) and not any(floats.values())
+    if temperatures and none_is_positive and not allow_zero:
         raise ValueError(
             f"{' + '.join(temperatures)} must be positive, got 0: without any regularisation the "
             "lifted policy is a maximum, not a distribution. Set a temperature above 0."
