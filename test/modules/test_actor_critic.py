@@ -69,6 +69,42 @@ def test_each_of_several_sets_of_parameters_gives_what_vmap_does():
     torch.testing.assert_close(*gradients)
 
 
+@pytest.mark.skipif(not torch.backends.mkldnn.is_available(), reason="PyTorch is without oneDNN")
+@pytest.mark.parametrize("batch_shape", [(), (16,), (0,), (3, 16)])
+def test_onednn_changes_no_more_than_the_rounding(monkeypatch, batch_shape):
+    torch.manual_seed(0)
+    network = DenseNetwork(["a"], ["out"], [5, 64, 64, 2])
+    inputs = torch.randn(*batch_shape, 5, requires_grad=True)
+    leaves = [inputs, *network.parameters()]
+
+    def output_and_gradients():
+        output = network(a=inputs)
+        first = torch.autograd.grad(output.square().sum(), leaves, create_graph=True)
+        second = torch.autograd.grad(first[0].square().sum(), network.weight_1)
+        return output, *first, *second
+
+    fast = output_and_gradients()
+    names = {type(node).__name__ for node in _graph(fast[0])}
+    assert ("_OneDNNLinearBackward" in names) == (batch_shape not in [(), (0,)])
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
+    plain = output_and_gradients()
+    torch.testing.assert_close(fast, plain)
+
+
+def _graph(output):
+    nodes = [output.grad_fn]
+    for node in nodes:
+        nodes += [parent for parent, _ in node.next_functions if parent is not None]
+    return nodes
+
+
+def test_other_precisions_are_left_to_torch():
+    network = DenseNetwork(["a"], ["out"], [5, 8, 2])
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert network(a=torch.zeros(3, 5)).dtype == torch.bfloat16
+    assert network.double()(a=torch.zeros(3, 5).double()).dtype == torch.float64
+
+
 def test_a_dense_network_starts_as_layers_of_torch_do():
     torch.manual_seed(0)
     network = DenseNetwork(["a"], ["out"], [100, 400, 1])

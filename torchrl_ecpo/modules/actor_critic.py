@@ -20,6 +20,7 @@ from tensordict.nn import (
     dispatch,
 )
 from torch import Tensor, nn
+from torch.autograd import Function
 from torch.nn.functional import linear
 from torchrl.data import Bounded, TensorSpec
 from torchrl.modules import ProbabilisticActor, TanhModule, TanhNormal
@@ -125,15 +126,66 @@ class DenseNetwork(TensorDictModuleBase):
     @staticmethod
     def _compute(x: Tensor, parameters: Sequence[Tensor]) -> Tensor:
         *hidden, last = zip(parameters[::2], parameters[1::2], strict=True)
+        batch_shape = x.shape[:-1]
+        if x.dim() > 2:
+            x = x.flatten(0, -2)
+        product = _fast_linear if _is_fast(x, parameters[0]) else linear
         for weight, bias in hidden:
-            x = linear(x, weight, bias).relu_()  # what goes into it is read by nobody else
-        return linear(x, *last)
+            x = product(x, weight, bias).relu_()  # what goes into it is read by nobody else
+        x = linear(x, *last)
+        return x.unflatten(0, batch_shape) if len(batch_shape) > 1 else x
 
     def _write(self, output: Tensor, tensordict: TensorDictBase) -> TensorDictBase:
         outputs = (output,) if self.head is None else self.head(output)
         for key, value in zip(self.out_keys, outputs, strict=True):
             tensordict.set(key, value)
         return tensordict
+
+
+class _OneDNNLinear(Function):
+    """``torch.nn.functional.linear`` of matrices, by oneDNN.
+
+    PyTorch multiplies matrices in single precision by MKL. On an AMD EPYC, oneDNN takes half the
+    time for layers of 256 units and batches of 256. Results differ by rounding.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+        ctx.save_for_backward(x, weight)
+        return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "none", [], "")
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,), (x, weight) = gradients, ctx.saved_tensors
+        of_x, of_weight, of_bias = ctx.needs_input_grad
+        product = _fast_linear if _is_fast(gradient, weight) else linear  # vmap of gradients
+        return (
+            product(gradient, weight.t(), None) if of_x else None,
+            product(gradient.t(), x.t(), None) if of_weight else None,
+            gradient.sum(0) if of_bias else None,
+        )
+
+
+_fast_linear: Callable[..., Tensor] = _OneDNNLinear.apply
+# The operator is PyTorch's own, but not a public one.
+_HAS_ONEDNN = torch.backends.mkldnn.is_available() and hasattr(
+    torch.ops.mkldnn, "_linear_pointwise"
+)
+
+
+def _is_fast(x: Tensor, weight: Tensor) -> bool:
+    """Whether :class:`_OneDNNLinear` can stand for ``linear``: eagerly, on floats of a CPU."""
+    return (
+        not torch.compiler.is_compiling()
+        and _HAS_ONEDNN
+        and torch.backends.mkldnn.enabled
+        and x.dim() == 2
+        and x.numel() > 0  # oneDNN refuses empty matrices
+        and x.dtype == weight.dtype == torch.float32
+        and x.device.type == "cpu"
+        and not torch.is_autocast_enabled("cpu")
+        and not torch._C._are_functorch_transforms_active()
+    )
 
 
 def _loc_and_scale(
