@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -106,6 +107,19 @@ def test_the_same_seed_gives_the_same_run_and_another_another(sweep, tmp_path):
     assert other["return"][2] != again["return"][2]
 
 
+@pytest.mark.slow  # one to four minutes
+def test_a_compiled_run_gives_the_metrics_of_a_run_that_is_not(sweep, tmp_path):
+    options = ("loss=ecac", "seed=3", "compile=true", f"hydra.run.dir={tmp_path}")
+    process = start(tmp_path, *TINY[:-1], *options)
+    assert process.returncode == 0, process.stderr
+    for name in ("policy", "update"):
+        assert re.search(rf"Compiled the {name} in \d+ s", process.stdout)
+    metrics, expected = read_metrics(tmp_path), read_metrics(sweep / "ecac")
+    assert metrics.keys() == expected.keys()
+    for name in metrics.keys() - {"steps_per_second"}:
+        assert metrics[name] == pytest.approx(expected[name], 1e-3, 1e-5, nan_ok=True), name
+
+
 def test_evaluation_does_not_disturb_training(sweep, tmp_path):
     often = run_ecac(tmp_path, "loss=td3", "seed=3", "evaluation.interval=80")
     seldom = read_metrics(sweep / "td3")
@@ -163,6 +177,7 @@ def test_an_unknown_task_is_refused_before_anything_starts(tmp_path):
         (["env=gym", "env.name=CartPole-v1"], "must be of bounded continuous actions"),
         (["env=dm_control", "env.task=fly"], "env.name=cheetah env.task=fly cannot be made"),
         (["collector.frames_per_batch=0"], "frames_per_batch must be an integer of at least 1"),
+        (["compile=yes"], "compile must be true or false, got 'yes'"),
         (["log_interval=70"], "evaluation.interval must be a multiple of log_interval"),
         (["replay_buffer.storage=tape"], "storage must be 'tensor' or 'memmap', got 'tape'"),
         (["~loss.lr.log_tau"], "loss.lr must have a learning rate for each of"),

@@ -156,6 +156,21 @@ def test_compare_names_runs_that_have_not_finished(sweep, tmp_path, capsys):
     assert [Path(line.split()[-1]).name for line in named] == ["ment", "urex"]
 
 
+@pytest.mark.slow  # one to four minutes
+@pytest.mark.parametrize("env", ["bandit", "gym"])
+def test_a_compiled_run_gives_the_metrics_of_a_run_that_is_not(tmp_path, env):
+    """With trajectories of other lengths in each batch, where there are steps."""
+    size = {"bandit": TINY, "gym": ("total_trajectories=96", "env=gym", "env.max_steps=40")}[env]
+    for compiled in ("true", "false"):
+        directory = tmp_path / compiled
+        run_ecpo(tmp_path, "seed=5", f"compile={compiled}", *size, f"hydra.run.dir={directory}")
+    metrics = read_metrics(tmp_path / "true")
+    expected = read_metrics(tmp_path / "false")
+    assert metrics.keys() == expected.keys()
+    for name, column in metrics.items():
+        assert column == pytest.approx(expected[name], rel=1e-3, abs=1e-5, nan_ok=True), name
+
+
 @pytest.mark.slow  # two to five minutes
 def test_groups_of_eight_learn_cartpole(tmp_path):
     run_ecpo(tmp_path, "env=gym", "seed=0", "evaluation_interval=10", f"hydra.run.dir={tmp_path}")
@@ -167,6 +182,9 @@ def test_groups_of_eight_learn_cartpole(tmp_path):
     ("overrides", "message"),
     [
         (["env=chess"], "Could not find 'env/chess'"),
+        (["compile=yes"], "compile must be true or false, got 'yes'"),
+        (["compile=true", "seeds=[0,1]"], "compile=true is for single runs, got seeds=[0, 1]"),
+        (["compile=true", "env=copy"], "compile=true is for tasks of the kinds ('bandit', 'gym')"),
         (["project_steps=0"], "project_steps must be an integer of at least 1, got 0"),
         (["anneal_from={metric:foo,at_least:1}"], "anneal_from.metric must be one of"),
         (["loss.tau=-1"], "tau must be a finite number >= 0, got -1"),

@@ -33,7 +33,7 @@ from utils import (
 )
 
 from torchrl_ecpo.collectors import shut_down
-from torchrl_ecpo.experiment import Checkpoints, Progress, Run
+from torchrl_ecpo.experiment import Checkpoints, Progress, Run, compile_module
 
 
 def total(losses: TensorDictBase, is_policy_due: bool) -> Tensor:
@@ -61,6 +61,10 @@ def main(config: DictConfig) -> None:
     optimizer = make_optimizer(config.loss.lr, loss_module)
     replay_buffer = make_replay_buffer(config)
     collector = make_collector(config, make_policy(config.loss, actor, evaluation_env))
+    if config.compile:
+        compile_module(loss_module, "update")
+    if config.compile and config.collector.kind == "single":
+        compile_module(actor, "policy")
 
     progress = Progress(frames=0, updates=0, returns=[])
     losses = TensorDict()

@@ -16,7 +16,7 @@ from score_sac import ScoreSACLoss
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
-from torchrl.collectors import BaseCollector, Collector
+from torchrl.collectors import Collector
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer
 from torchrl.envs import (
     CatTensors,
@@ -87,6 +87,8 @@ def check_config(config: DictConfig) -> None:
         )
     if not isinstance(config.seed, int):
         raise ValueError(f"seed must be an integer, got {config.seed!r}.")
+    if not isinstance(config.compile, bool):
+        raise ValueError(f"compile must be true or false, got {config.compile!r}.")
     if config.replay_buffer.storage not in ("tensor", "memmap"):
         raise ValueError(
             "replay_buffer.storage must be 'tensor' or 'memmap', got "
@@ -258,7 +260,7 @@ def _plain(setting: DictConfig) -> Any:
 # --------------------------------------------------------------------------------------------- data
 
 
-def make_collector(config: DictConfig, policy: TensorDictModuleBase) -> BaseCollector:
+def make_collector(config: DictConfig, policy: TensorDictModuleBase) -> Any:
     """One collector in this process, or several in processes of their own."""
     options: dict[str, Any] = {
         "frames_per_batch": config.collector.frames_per_batch,

@@ -13,7 +13,7 @@ from stack import make_stack
 from utils import check_config, is_single, make_optimizer, make_parts, reached
 
 from torchrl_ecpo.collectors import shut_down
-from torchrl_ecpo.experiment import Checkpoints, Progress
+from torchrl_ecpo.experiment import Checkpoints, Progress, compile_module
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
@@ -24,6 +24,8 @@ def main(config: DictConfig) -> None:
 
     parts = make_parts(config) if config.seeds is None else make_stack(config)
     task, collector, loss_module, temperatures, run, clip_grad_norm_ = parts
+    if config.compile:
+        compile_module(loss_module, "loss")
     optimizer = make_optimizer(config.optim, loss_module)
     max_grad_norm = config.optim.max_grad_norm or float("inf")
 

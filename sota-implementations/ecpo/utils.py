@@ -25,6 +25,7 @@ LOSSES = {
     "ment": MENTLoss,
 }
 TEMPERATURES = ("tau", "tau_prime")
+COMPILABLE = ("bandit", "gym")
 
 
 def check_config(config: DictConfig) -> None:
@@ -36,6 +37,19 @@ def check_config(config: DictConfig) -> None:
             raise ValueError(f"{name} must be an integer of at least 1, got {value!r}.")
     if not isinstance(config.seed, int):
         raise ValueError(f"seed must be an integer, got {config.seed!r}.")
+    if not isinstance(config.compile, bool):
+        raise ValueError(f"compile must be true or false, got {config.compile!r}.")
+    if config.compile and config.seeds is not None:
+        raise ValueError(
+            f"compile=true is for single runs, got seeds={config.seeds}. Leave out compile, or "
+            "start a run for each seed: --multirun seed=..."
+        )
+    if config.compile and config.env.kind not in COMPILABLE:
+        raise ValueError(
+            f"compile=true is for tasks of the kinds {COMPILABLE}, got env.kind="
+            f"{config.env.kind!r}, whose policy computes each distinct history once: how much that "
+            "is differs from batch to batch. Leave out compile."
+        )
 
 
 class Parts(NamedTuple):

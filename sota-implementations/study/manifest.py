@@ -28,7 +28,7 @@ KINDS = ("curves", "heat_map", "ranking")
 # Runs that differ in these alone have the same numbers, as far as both go: the entries of env are
 # those that other entries are read from.
 NOT_THE_RUN = (
-    *("resume", "checkpoint", "logger", "threads"),
+    *("resume", "checkpoint", "logger", "threads", "compile"),
     *("env.settings", "env.optim", "env.cracked", "env.evaluation_interval"),
 )
 

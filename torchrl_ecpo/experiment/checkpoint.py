@@ -30,7 +30,7 @@ __all__ = ["Checkpoints", "Progress"]
 
 FOLDER = "checkpoints"
 # A run that differs in these alone is the same run.
-FREE_OPTIONS = ("resume", "checkpoint")
+FREE_OPTIONS = ("resume", "checkpoint", "compile")
 # Useless once a run has finished, and most of its checkpoint.
 ONLY_TO_GO_ON = {"replay_buffer"}
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -326,5 +326,5 @@ def _differences(saved: dict[str, Any], present: dict[str, Any]) -> list[str]:
         f"{name} was {old.get(name, 'absent')}, is {new.get(name, 'absent')}"
         for name in sorted(old.keys() | new.keys())
         if name not in old or name not in new or old[name] != new[name]
-        if not (name.startswith("total_") and old[name] < new[name])
+        if not (name.startswith("total_") and float(old[name]) < float(new[name]))
     ]
