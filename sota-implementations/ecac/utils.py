@@ -44,6 +44,7 @@ from torchrl_ecpo import (
 )
 from torchrl_ecpo.collectors import SupervisedAsyncCollector, SupervisedSyncCollector
 from torchrl_ecpo.envs import EpisodeReplay
+from torchrl_ecpo.experiment import check_options
 from torchrl_ecpo.modules import (
     make_deterministic_actor,
     make_qvalue_network,
@@ -68,27 +69,13 @@ LONGEST_EPISODE = 100_000
 
 def check_config(config: DictConfig) -> None:
     """Refuse settings with which a run would never end, or break late."""
-    counts = {
-        "total_frames": config.total_frames,
-        "log_interval": config.log_interval,
-        "evaluation.interval": config.evaluation.interval,
-        "evaluation.episodes": config.evaluation.episodes,
-        "collector.frames_per_batch": config.collector.frames_per_batch,
-        "updates_per_frame": config.updates_per_frame,
-        "threads": config.threads,
-    }
-    for name, value in counts.items():
-        if not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name} must be an integer of at least 1, got {value!r}.")
+    counts = ("total_frames", "log_interval", "updates_per_frame", "collector.frames_per_batch")
+    check_options(config, (*counts, "evaluation.interval", "evaluation.episodes"))
     if config.evaluation.interval % config.log_interval:
         raise ValueError(
             "evaluation.interval must be a multiple of log_interval, got "
             f"{config.evaluation.interval} and {config.log_interval}."
         )
-    if not isinstance(config.seed, int):
-        raise ValueError(f"seed must be an integer, got {config.seed!r}.")
-    if not isinstance(config.compile, bool):
-        raise ValueError(f"compile must be true or false, got {config.compile!r}.")
     if config.replay_buffer.storage not in ("tensor", "memmap"):
         raise ValueError(
             "replay_buffer.storage must be 'tensor' or 'memmap', got "

@@ -14,7 +14,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 
 from torchrl_ecpo import ECPOLoss, MENTLoss, PMDLoss, TrajectoryGroupLoss, UREXLoss
 from torchrl_ecpo.collectors import TrajectoryGroupCollector
-from torchrl_ecpo.experiment import Run
+from torchrl_ecpo.experiment import Run, check_options
 from torchrl_ecpo.schedules import TemperatureScheduler, make_schedule
 
 LOSSES = {
@@ -29,16 +29,9 @@ COMPILABLE = ("bandit", "gym")
 
 
 def check_config(config: DictConfig) -> None:
-    """Refuse counts with which a run would never end, or never begin."""
-    names = ("total_trajectories", "evaluation_interval", "num_groups", "group_size")
-    for name in (*names, "project_steps", "threads"):
-        value = config[name]
-        if not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name} must be an integer of at least 1, got {value!r}.")
-    if not isinstance(config.seed, int):
-        raise ValueError(f"seed must be an integer, got {config.seed!r}.")
-    if not isinstance(config.compile, bool):
-        raise ValueError(f"compile must be true or false, got {config.compile!r}.")
+    """Refuse settings with which a run would never end, or never begin."""
+    counts = ("total_trajectories", "evaluation_interval", "num_groups", "group_size")
+    check_options(config, (*counts, "project_steps"))
     if config.compile and config.seeds is not None:
         raise ValueError(
             f"compile=true is for single runs, got seeds={config.seeds}. Leave out compile, or "

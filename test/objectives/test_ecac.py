@@ -402,7 +402,7 @@ def test_defaults():
     loss = ECACLoss(networks.actor, networks.qvalues)
     PolyakAverage(loss)
     outputs = call(loss, make_batch())
-    assert_close((outputs["tau"], outputs["tau_prime"]), (torch.tensor(0.3), torch.tensor(0.1)))
+    assert_close((outputs["tau"], outputs["tau_prime"]), (torch.tensor(0.3), torch.tensor(1.0)))
     assert (loss.target_kl, loss.target_entropy, loss.projection) == (0.083, "auto", "centred")
     assert (loss.num_action_samples, loss.num_next_action_samples) == (8, 1)
     assert (loss.min_tau, loss.min_tau_prime) == (0.001, 0.003)

@@ -257,7 +257,7 @@ def test_defaults():
     PolyakAverage(loss)
     outputs = call(loss, make_batch())
     assert loss.out_keys[:3] == ["loss_actor", "loss_qvalue", "loss_tau_prime"]
-    assert_close((outputs["tau"], outputs["tau_prime"]), (torch.tensor(0.1), torch.tensor(0.1)))
+    assert_close((outputs["tau"], outputs["tau_prime"]), (torch.tensor(0.1), torch.tensor(1.0)))
     assert (loss.target_kl, loss.target_entropy, loss.delay_actor) == (None, "auto", True)
     assert (loss.num_action_samples, loss.num_next_action_samples) == (1, 1)
     total(outputs).backward()

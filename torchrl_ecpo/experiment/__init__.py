@@ -2,6 +2,14 @@
 
 from torchrl_ecpo.experiment.checkpoint import Checkpoints, Progress
 from torchrl_ecpo.experiment.compiling import compile_module
-from torchrl_ecpo.experiment.run import MetricsTable, Run, read_metrics
+from torchrl_ecpo.experiment.run import MetricsTable, Run, check_options, read_metrics
 
-__all__ = ["Checkpoints", "MetricsTable", "Progress", "Run", "compile_module", "read_metrics"]
+__all__ = [
+    "Checkpoints",
+    "MetricsTable",
+    "Progress",
+    "Run",
+    "check_options",
+    "compile_module",
+    "read_metrics",
+]

@@ -23,13 +23,40 @@ from tqdm import tqdm
 
 from torchrl_ecpo.experiment.figures import plot_learning_curve
 
-__all__ = ["METRICS_FILE", "MetricsTable", "Run", "read_metrics"]
+__all__ = ["METRICS_FILE", "MetricsTable", "Run", "check_options", "read_metrics"]
 
 METRICS_FILE = "metrics.csv"
 BACKENDS = ("csv", "tensorboard", "wandb", "none")
 RECORDED_PACKAGES = ("torchrl-ecpo", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
 
 Metrics = Mapping[str, float | Tensor]
+
+
+def check_options(config: DictConfig, counts: Sequence[str]) -> None:
+    """Refuse options that both scripts have, with which a run would never end, or break late.
+
+    Args:
+        config: of the run.
+        counts: names of options that must be integers of at least 1, beside ``threads``.
+
+    Raises:
+        ValueError: naming the option, what was expected, and what came.
+
+    Examples:
+        >>> config = OmegaConf.create({"seed": 1, "compile": False, "threads": 1, "size": {"k": 0}})
+        >>> check_options(config, ["size.k"])
+        Traceback (most recent call last):
+            ...
+        ValueError: size.k must be an integer of at least 1, got 0.
+    """
+    for name in (*counts, "threads"):
+        value = OmegaConf.select(config, name)
+        if not isinstance(value, int) or value < 1:
+            raise ValueError(f"{name} must be an integer of at least 1, got {value!r}.")
+    if not isinstance(config.seed, int):
+        raise ValueError(f"seed must be an integer, got {config.seed!r}.")
+    if not isinstance(config.compile, bool):
+        raise ValueError(f"compile must be true or false, got {config.compile!r}.")
 
 
 class MetricsTable:
