@@ -496,6 +496,11 @@ def test_worker_processes(sync):
         os.kill(collector.procs[0].pid, signal.SIGKILL)
         with pytest.raises(ChildProcessError, match=r"Worker 0 .* by SIGKILL.* resume=auto"):
             collector.update_policy_weights_()
+        # Else a process that was interrupted while it wrote to one would never end.
+        schemes = collector._weight_sync_schemes.values()
+        queues = [queue for each in schemes for queue in each._instruction_queues.values()]
+        assert queues
+        assert all(queue._joincancelled for queue in queues)
     finally:
         collector.shutdown()
     assert not any(process.is_alive() for process in collector.procs)

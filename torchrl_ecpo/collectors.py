@@ -660,8 +660,15 @@ class _Supervised(MultiCollector):
                 raise
             for process in running.values():
                 process.kill()
+            self._leave_queues()
             worker, code = dead
             raise ChildProcessError(_describe_death(worker, _describe_exit(code))) from error
+
+    def _leave_queues(self) -> None:
+        """Let this process end without its queues: a `put` that was interrupted never comes out."""
+        for scheme in (self._weight_sync_schemes or {}).values():
+            for queue in (getattr(scheme, "_instruction_queues", None) or {}).values():
+                queue.cancel_join_thread()
 
     def _stop_waiting(self, *_: Any) -> None:
         if self._find_dead() is not None:
