@@ -16,7 +16,9 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from csv_table import add_csv_option, write_csv
@@ -24,6 +26,12 @@ from hydra import compose, initialize_config_dir
 from loop import Iteration, take_turns
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
+from torchrl.data import ReplayBuffer
+from torchrl.envs import EnvBase
+from torchrl.modules import ProbabilisticActor
+from torchrl.objectives import LossModule, TargetNetUpdater
+
+from torchrl_ecpo.experiment import compile_module
 
 SCRIPT = Path(__file__).resolve().parents[1] / "sota-implementations/ecac"
 sys.path.append(str(SCRIPT))
@@ -47,8 +55,9 @@ UPDATES = {
 }
 LOOPS = {"sac": ["loss=sac"], "ecac": ["loss=ecac"]}
 
-
-FRAMES = 200  # of a loop, in its turn
+# Made in a turn
+NUM_UPDATES = 10
+FRAMES = 200
 
 
 def configure(overrides: list[str]) -> DictConfig:
@@ -56,6 +65,32 @@ def configure(overrides: list[str]) -> DictConfig:
     with initialize_config_dir(str(SCRIPT / "config"), version_base="1.3"):
         frames = ["total_frames=-1", "collector.init_random_frames=0"]
         return compose("config", ["env=halfcheetah", *frames, *overrides])
+
+
+class Parts(NamedTuple):
+    """What the script makes from its configuration to train."""
+
+    env: EnvBase
+    actor: ProbabilisticActor
+    loss_module: LossModule
+    updater: TargetNetUpdater
+    optimizer: torch.optim.Optimizer
+
+
+def make_parts(config: DictConfig) -> Parts:
+    """The script's parts, with the same weights each time."""
+    env = make_environment(config, seed=0)
+    torch.manual_seed(0)
+    actor = make_actor(config, env)
+    loss_module = make_loss(config, actor, env)
+    updater = make_updater(config, loss_module)
+    return Parts(env, actor, loss_module, updater, make_optimizer(config.loss.lr, loss_module))
+
+
+def make_data(config: DictConfig, parts: Parts) -> tuple[ReplayBuffer, Iterator[TensorDictBase]]:
+    """The script's buffer, empty, and what its collector yields."""
+    policy = make_policy(config.loss, parts.actor, parts.env)
+    return make_replay_buffer(config), iter(make_collector(config, policy))
 
 
 def random_batch(env_batch: TensorDictBase, size: int) -> TensorDict:
@@ -84,32 +119,28 @@ def step(optimizer: torch.optim.Optimizer, losses: TensorDictBase) -> None:
     optimizer.zero_grad()
 
 
-def update(config: DictConfig) -> Iteration:
-    """Updates on one random batch."""
-    env = make_environment(config, seed=0)
+def update(config: DictConfig, *, is_compiled: bool = False) -> Iteration:
+    """Updates on one random batch, of which the loss gets a fresh copy as from a buffer."""
+    env, _, loss_module, updater, optimizer = make_parts(config)
     batch = random_batch(env.fake_tensordict(), config.replay_buffer.batch_size)
-    loss_module = make_loss(config, make_actor(config, env), env)
-    updater = make_updater(config, loss_module)
-    optimizer = make_optimizer(config.loss.lr, loss_module)
+    batch = batch.select(*loss_module.in_keys)
+    if is_compiled:
+        compile_module(loss_module, "update")
 
     def iterate() -> int:
-        for _ in range(10):
-            step(optimizer, loss_module(batch))
+        for _ in range(NUM_UPDATES):
+            step(optimizer, loss_module(batch.copy()))
             updater.step()
-        return 10
+        return NUM_UPDATES
 
     return iterate
 
 
 def script_loop(config: DictConfig) -> Iteration:
     """Batches of the collector, and an update for each of their frames."""
-    env = make_environment(config, seed=0)
-    actor = make_actor(config, env)
-    loss_module = make_loss(config, actor, env)
-    updater = make_updater(config, loss_module)
-    optimizer = make_optimizer(config.loss.lr, loss_module)
-    replay_buffer = make_replay_buffer(config)
-    batches = iter(make_collector(config, make_policy(config.loss, actor, env)))
+    parts = make_parts(config)
+    _, _, loss_module, updater, optimizer = parts
+    replay_buffer, batches = make_data(config, parts)
 
     def iterate() -> int:
         frames = 0

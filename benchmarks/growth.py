@@ -21,17 +21,11 @@ import time
 from collections.abc import Callable
 
 import torch
-from actor_critic import configure, random_batch
+from actor_critic import configure, make_parts, random_batch
 from csv_table import add_csv_option, write_csv
 from ecac import total  # pyright: ignore[reportMissingImports]
 from tensordict import TensorDict
 from torch import Tensor
-from utils import (  # pyright: ignore[reportMissingImports]
-    make_actor,
-    make_environment,
-    make_loss,
-    make_updater,
-)
 
 from torchrl_ecpo import ECPOLoss
 from torchrl_ecpo.modules import make_tuple_policy
@@ -64,10 +58,7 @@ def ecpo(G: int, K: int, T: int) -> Callable[[], Tensor]:
 def ecac(B: int, M: int) -> Callable[[], Tensor]:
     """The losses of a batch of random transitions."""
     sizes = [f"loss.options.num_action_samples={M}", f"loss.options.num_actor_states={B // 2}"]
-    config = configure(["loss=ecac", *sizes])
-    env = make_environment(config, seed=0)
-    loss_module = make_loss(config, make_actor(config, env), env)
-    make_updater(config, loss_module)  # without one, the loss warns
+    env, _, loss_module, *_ = make_parts(configure(["loss=ecac", *sizes]))
     batch = random_batch(env.fake_tensordict(), B)
     return lambda: total(loss_module(batch.copy()), is_policy_due=True)
 

@@ -51,9 +51,10 @@ GROUP_SIZE, PROJECT_STEPS = 10, 5
 NUM_OBSERVATIONS, NVEC = 3, (2, 2, 2)  # of Reverse
 NUM_CLASSES = (NUM_OBSERVATIONS, *(n + 1 for n in NVEC))
 TAU, TAU_PRIME, MAX_GRAD_NORM, LEARNING_RATE = 0.5, 0.01, 50.0, 1e-9
+STRAY, WRITE = 0.02, 0.002  # probabilities of a move to the left and of writing
 
 Iteration = Callable[[], int]
-"""One iteration of a training loop; returns the number of steps that it collected."""
+"""One iteration of a training loop; returns the number of steps that it made."""
 
 
 def make_env(level: int, num_groups: int) -> AlgorithmicEnv:
@@ -67,14 +68,20 @@ def make_env(level: int, num_groups: int) -> AlgorithmicEnv:
     )
 
 
-def make_actor(stray: float, write: float) -> ProbabilisticActor:
-    """A policy that moves left with probability `stray` and writes with probability `write`."""
+def make_actor(stray: float = STRAY, write: float = WRITE) -> ProbabilisticActor:
+    """A policy whose trajectories last."""
     torch.manual_seed(0)
     actor = make_tuple_policy(NUM_OBSERVATIONS, NVEC)
-    readout = next(module for module in actor.modules() if isinstance(module, nn.Linear))
-    with torch.no_grad():
-        readout.bias.copy_(torch.tensor([stray, 1 - stray, 1 - write, write, 0.5, 0.5]).log())
+    bias_to_last(actor, stray, write)
     return actor
+
+
+def bias_to_last(actor: nn.Module, stray: float = STRAY, write: float = WRITE) -> None:
+    """Let a policy move left with probability `stray` and write with probability `write`."""
+    readout = next(module for module in actor.modules() if isinstance(module, nn.Linear))
+    bias = torch.tensor([stray, 1 - stray, 1 - write, write, 0.5, 0.5]).log()
+    with torch.no_grad():
+        readout.bias.copy_(bias.expand_as(readout.bias))
 
 
 def ecpo_loop(level: int, num_groups: int, actor: ProbabilisticActor) -> Iteration:
@@ -347,8 +354,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--levels", type=int, nargs="+", default=[2, 10, 30])
     parser.add_argument("--groups", type=int, default=40)
-    parser.add_argument("--stray", type=float, default=0.02)
-    parser.add_argument("--write", type=float, default=0.002)
+    parser.add_argument("--stray", type=float, default=STRAY)
+    parser.add_argument("--write", type=float, default=WRITE)
     parser.add_argument("--repeats", type=int, default=10)
     parser.add_argument("--profile", action="store_true", help="of a step, at the first level")
     add_csv_option(parser)

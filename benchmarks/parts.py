@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import torch
-from actor_critic import configure
+from actor_critic import configure, make_data, make_parts
 from csv_table import add_csv_option, write_csv
 from ecac import total  # pyright: ignore[reportMissingImports]
 from loop import (
@@ -32,21 +32,11 @@ from loop import (
     make_env,
 )
 from torch.nn.utils import clip_grad_norm_
-from utils import make_actor as make_control_actor  # pyright: ignore[reportMissingImports]
-from utils import (  # pyright: ignore[reportMissingImports]
-    make_collector,
-    make_environment,
-    make_loss,
-    make_optimizer,
-    make_policy,
-    make_replay_buffer,
-    make_updater,
-)
 
 from torchrl_ecpo import ECPOLoss
 from torchrl_ecpo.collectors import TrajectoryGroupCollector
 
-LEVEL, NUM_GROUPS, STRAY, WRITE = 10, 40, 0.02, 0.002
+LEVEL, NUM_GROUPS = 10, 40
 
 
 class Stopwatch:
@@ -70,7 +60,7 @@ Iteration = Callable[[Stopwatch], int]
 
 def ecpo() -> Iteration:
     """A lift and its projections."""
-    actor = make_actor(STRAY, WRITE)
+    actor = make_actor()
     collector = TrajectoryGroupCollector(
         make_env(LEVEL, NUM_GROUPS),
         actor,
@@ -104,13 +94,9 @@ def ecpo() -> Iteration:
 def control(loss: str) -> Iteration:
     """A batch of the collector, and an update for each of its frames."""
     config = configure([f"loss={loss}"])
-    env = make_environment(config, seed=0)
-    actor = make_control_actor(config, env)
-    loss_module = make_loss(config, actor, env)
-    updater = make_updater(config, loss_module)
-    optimizer = make_optimizer(config.loss.lr, loss_module)
-    replay_buffer = make_replay_buffer(config)
-    batches = iter(make_collector(config, make_policy(config.loss, actor, env)))
+    parts = make_parts(config)
+    _, _, loss_module, updater, optimizer = parts
+    replay_buffer, batches = make_data(config, parts)
 
     def iterate(part: Stopwatch) -> int:
         with part("collect"):

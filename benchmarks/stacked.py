@@ -15,18 +15,15 @@ from __future__ import annotations
 
 import argparse
 import os
-import statistics
 import sys
 import tempfile
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 from csv_table import add_csv_option, write_csv
 from hydra import compose, initialize_config_dir
-from torch import nn
+from loop import PROJECT_STEPS, Iteration, bias_to_last, take_turns
 
 SCRIPT = Path(__file__).resolve().parents[1] / "sota-implementations/ecpo"
 sys.path.insert(0, str(SCRIPT))
@@ -36,11 +33,6 @@ from utils import (  # noqa: E402 # pyright: ignore[reportMissingImports]
     make_optimizer,
     make_parts,
 )
-
-PROJECT_STEPS = 5
-STRAY, WRITE = 0.02, 0.002  # probabilities of a move to the left and of writing, as in loop.py
-
-Iteration = Callable[[], None]
 
 
 def make_iteration(env: str, level: int | None, seeds: list[int] | None) -> Iteration:
@@ -55,7 +47,7 @@ def make_iteration(env: str, level: int | None, seeds: list[int] | None) -> Iter
     batches = iter(parts.collector)
     iteration = 0
 
-    def iterate() -> None:
+    def iterate() -> int:
         nonlocal iteration
         if iteration % PROJECT_STEPS == 0:
             parts.collector.update_policy_weights_()
@@ -69,6 +61,7 @@ def make_iteration(env: str, level: int | None, seeds: list[int] | None) -> Iter
         optimizer.step()
         metrics |= {**parts.task.measure(groups), **parts.temperatures.values()}
         parts.run.log(metrics, iteration)
+        return 1
 
     return iterate
 
@@ -79,22 +72,7 @@ def lengthen(parts: Any, level: int) -> None:
     for own in getattr(env, "runs", [env]):
         own.curriculum.levels.fill_(level)
         own.curriculum.kind = None
-    readout = next(m for m in parts.task.actor.modules() if isinstance(m, nn.Linear))
-    bias = torch.tensor([STRAY, 1 - STRAY, 1 - WRITE, WRITE, 0.5, 0.5]).log()
-    with torch.no_grad():
-        readout.bias.copy_(bias.expand_as(readout.bias))
-
-
-def take_turns(loops: list[Iteration], repeats: int) -> list[float]:
-    """Median processor time in milliseconds of an iteration of each."""
-    seen: list[list[float]] = [[] for _ in loops]
-    for repeat in range(repeats + 2):
-        for iterate, times in zip(loops, seen, strict=True):
-            started = time.process_time()
-            iterate()
-            if repeat > 1:
-                times.append(1e3 * (time.process_time() - started))
-    return [statistics.median(times) for times in seen]
+    bias_to_last(parts.task.actor)
 
 
 def main() -> None:
@@ -115,7 +93,7 @@ def main() -> None:
         for env, level in cases:
             loops = [make_iteration(env, level, None)]
             loops += [make_iteration(env, level, list(range(n))) for n in arguments.runs]
-            single, *stacked = take_turns(loops, arguments.repeats)
+            (single, *stacked), _, _ = take_turns(loops, arguments.repeats)
             for runs, ms in zip(arguments.runs, stacked, strict=True):
                 gain = runs * single / ms
                 shown = "begin" if level is None else str(level)
