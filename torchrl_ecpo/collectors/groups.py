@@ -7,27 +7,18 @@ trajectories together; the environment has the batch size `[*B, K]` with `prod(B
 from __future__ import annotations
 
 import inspect
-import signal
-import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence, Set
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing.connection import wait
 from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor, nn
-from torchrl.collectors import (
-    BaseCollector,
-    Collector,
-    MultiAsyncCollector,
-    MultiCollector,
-    MultiSyncCollector,
-)
+from torchrl.collectors import Collector, MultiCollector
 from torchrl.collectors.distributed import RayCollector
 from torchrl.collectors.utils import _maybe_normalize_replay_buffer_tensordict_device
 from torchrl.envs import EnvBase, TransformedEnv
@@ -39,14 +30,14 @@ try:
 except ImportError:  # an extra, which TorchRL asks for in its own words
     ray: Any = None
 
+from torchrl_ecpo.collectors.supervised import (
+    SupervisedAsyncCollector,
+    SupervisedSyncCollector,
+    describe_death,
+)
 from torchrl_ecpo.data import GROUP_KEY, MASK_KEY, TRAJECTORY_KEY, pack_groups, unpack_groups
 
-__all__ = [
-    "SupervisedAsyncCollector",
-    "SupervisedSyncCollector",
-    "TrajectoryGroupCollector",
-    "shut_down",
-]
+__all__ = ["TrajectoryGroupCollector"]
 
 _DONE_NAMES = ("done", "terminated", "truncated")
 
@@ -604,152 +595,14 @@ def _check_arguments(num_groups: int, group_size: int, options: dict[str, Any]) 
             raise TypeError(f"TrajectoryGroupCollector does not take {name}: {_REFUSED[name]}.")
 
 
-class _WorkerDied(BaseException):
-    """Passes through what catches errors while it waits for a worker."""
+def _accepted(options: dict[str, Any]) -> dict[str, Any]:
+    """What TorchRL's collectors pass on to a worker, but for what groups leave no room for."""
+    return {name: value for name, value in options.items() if name not in _REFUSED}
 
 
-class _Supervised(MultiCollector):
-    """Ends with a clear error when a worker process dies.
-
-    TorchRL looks after its workers from time to time. Yet it may wait for ever for what a dead one
-    was about to send, such as the acknowledgement of new weights.
-    """
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        kwargs.setdefault("init_fn", _leave_interrupts_to_the_run)
-        super().__init__(*args, **kwargs)
-
-    def iterator(self) -> Iterator[TensorDictBase | None]:
-        """Yield batches.
-
-        Raises:
-            ChildProcessError: if a worker has died.
-        """
-        batches = super().iterator()  # pyright: ignore[reportAbstractUsage]
-        while True:
-            with self._watch():
-                try:
-                    batch = next(batches)
-                except StopIteration:
-                    return
-            yield batch
-
-    def update_policy_weights_(self, *args: Any, **kwargs: Any) -> None:
-        """Send the weights of the policy, or those given, to the workers.
-
-        Raises:
-            ChildProcessError: if a worker has died.
-        """
-        with self._watch():
-            super().update_policy_weights_(*args, **kwargs)
-
-    @contextmanager
-    def _watch(self) -> Iterator[None]:
-        """Within, the death of a worker is an error at once."""
-        try:
-            with _call_when_a_child_ends(self._stop_waiting):
-                self._stop_waiting()
-                yield
-        except (_WorkerDied, Exception) as error:
-            # A worker's connections end before itself.
-            running = {proc.sentinel: proc for proc in self.procs if not proc._closed}
-            for ended in wait(list(running), timeout=5.0):
-                running[ended].join()
-            dead = self._find_dead()
-            if dead is None:
-                raise
-            for process in running.values():
-                process.kill()
-            self._leave_queues()
-            worker, code = dead
-            raise ChildProcessError(_describe_death(worker, _describe_exit(code))) from error
-
-    def _leave_queues(self) -> None:
-        """Let this process end without its queues: a `put` that was interrupted never comes out."""
-        for scheme in (self._weight_sync_schemes or {}).values():
-            for queue in (getattr(scheme, "_instruction_queues", None) or {}).values():
-                queue.cancel_join_thread()
-
-    def _stop_waiting(self, *_: Any) -> None:
-        if self._find_dead() is not None:
-            raise _WorkerDied
-
-    def _find_dead(self) -> tuple[int, int] | None:
-        """The first worker that has ended, and its exit code."""
-        for worker, process in enumerate(self.procs):
-            if not process._closed and process.exitcode is not None:
-                return worker, process.exitcode
-        return None
-
-
-@contextmanager
-def _call_when_a_child_ends(handle: Callable[..., None]) -> Iterator[None]:
-    """Within, `handle` interrupts whatever this process waits for when a child process ends.
-
-    The system tells so by a signal, which the main thread gets; elsewhere nothing is called.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    previous = signal.signal(signal.SIGCHLD, handle)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGCHLD, previous or signal.SIG_DFL)
-
-
-def _leave_interrupts_to_the_run() -> None:
-    """Ctrl-C reaches all processes of a terminal; the run's own tells the workers when to end."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _describe_exit(code: int) -> str:
-    if code >= 0:
-        return f"ended with exit code {code}: its own error is printed above"
-    hint = ", as the system does when memory runs out" if code == -signal.SIGKILL else ""
-    return f"was killed by {signal.Signals(-code).name}{hint}"
-
-
-def _describe_death(worker: int, cause: str) -> str:
-    return (
-        f"Worker {worker} of the collector {cause}. The run cannot go on without it; start the run "
-        "again with resume=<run directory> or resume=auto to go on from its last checkpoint."
-    )
-
-
-@contextmanager
-def shut_down(collector: BaseCollector) -> Iterator[None]:
-    """End a collector however the block ends: its workers would keep the process alive.
-
-    Examples:
-        >>> from torchrl.envs import GymEnv
-        >>> collector = Collector(GymEnv("Pendulum-v1"), frames_per_batch=2, total_frames=2)
-        >>> with shut_down(collector):
-        ...     next(iter(collector)).shape
-        torch.Size([2])
-    """
-    try:
-        yield
-    finally:
-        collector.shutdown()
-
-
-class SupervisedSyncCollector(_Supervised, MultiSyncCollector):
-    """TorchRL's ``MultiSyncCollector``; the death of a worker is a ``ChildProcessError`` at once.
-
-    Examples:
-        >>> issubclass(SupervisedSyncCollector, MultiSyncCollector)
-        True
-    """
-
-
-class SupervisedAsyncCollector(_Supervised, MultiAsyncCollector):
-    """TorchRL's ``MultiAsyncCollector``; the death of a worker is a ``ChildProcessError`` at once.
-
-    Examples:
-        >>> issubclass(SupervisedAsyncCollector, MultiAsyncCollector)
-        True
-    """
+def _packer(options: dict[str, Any]) -> Callable[[TensorDictBase], TensorDict]:
+    """What makes groups of the steps of workers."""
+    return partial(pack_groups, group_size=options["group_size"], group_key=options["group_key"])
 
 
 class _Worker:
@@ -760,8 +613,7 @@ class _Worker:
         self.options = options
 
     def __call__(self, *args: Any, **kwargs: Any) -> TrajectoryGroupCollector:
-        kwargs = {key: value for key, value in kwargs.items() if key not in _REFUSED}
-        collector = TrajectoryGroupCollector(*args, **{**kwargs, **self.options})
+        collector = TrajectoryGroupCollector(*args, **{**_accepted(kwargs), **self.options})
         collector._yield_flat = True
         collector._restarted = self.restarted[kwargs["worker_idx"]]
         return collector
@@ -775,9 +627,7 @@ class _GroupsOfWorkers(MultiCollector):
         create_env_fn = args[0]
         num_workers = len(create_env_fn)
         self._worker = _Worker(num_workers, {"num_groups": num_groups, **options})
-        self._pack = partial(
-            pack_groups, group_size=options["group_size"], group_key=options["group_key"]
-        )
+        self._pack = _packer(options)
         total_frames = kwargs.pop("total_frames")
         writes = kwargs.get("replay_buffer") is not None
         # What a worker writes to a buffer it processes itself; what it hands over is packed first.
@@ -838,8 +688,7 @@ class _RayWorker(TrajectoryGroupCollector):
     """The collector of a Ray actor, which hands over its batches flat."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        kwargs = {key: value for key, value in kwargs.items() if key not in _REFUSED}
-        super().__init__(*args, **kwargs)
+        super().__init__(*args, **_accepted(kwargs))
         self._yield_flat = True
 
     def __repr__(self) -> str:
@@ -868,9 +717,7 @@ class _RayGroups(RayCollector):
             raise TypeError("backend='ray' does not write to a replay_buffer: extend it yourself.")
         taken = inspect.signature(RayCollector.__init__).parameters
         passed_on = {key: kwargs.pop(key) for key in list(kwargs) if key not in taken}
-        self._pack = partial(
-            pack_groups, group_size=options["group_size"], group_key=options["group_key"]
-        )
+        self._pack = _packer(options)
         super().__init__(
             list(create_env_fn),
             policy,
@@ -919,7 +766,7 @@ class _RayGroups(RayCollector):
                 try:
                     ray.get(actor.__ray_ready__.remote(), timeout=10.0)
                 except ray.exceptions.RayActorError as dead:
-                    died = _describe_death(worker, "died in the Ray cluster")
+                    died = describe_death(worker, "died in the Ray cluster")
                     raise ChildProcessError(died) from dead
             raise
 
