@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from manifest import Cell, add_ignored, argument_parser, differences, read_manifests
+from manifest import Cell, add_ignored, argument_parser, changed_entries, read_manifests
 from records import Record, find_records
 from results import RESULTS, Results
 
@@ -20,13 +20,13 @@ def is_of(cell: Cell, record: Record, ignored: Sequence[str]) -> bool:
     """Whether a run is one of a cell."""
     if record.seed not in cell.seeds or cell.total_option != f"total_{record.unit}":
         return False
-    return not differences(record.identity, cell.identity(record.seed), ignored)
+    return not changed_entries(record.identity, cell.identity(record.seed), ignored)
 
 
 def nearest(record: Record, cells: Iterable[Cell]) -> str:
     """The cell to which a run comes closest, and what differs, in words."""
     compared = [
-        (differences(cell.identity(record.seed), record.identity), cell)
+        (changed_entries(cell.identity(record.seed), record.identity), cell)
         for cell in cells
         if cell.total_option == f"total_{record.unit}"
     ]

@@ -19,7 +19,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from torchrl_ecpo.experiment.run import flatten
+from torchrl_ecpo.experiment.run import differences, flatten
 
 HERE = Path(__file__).resolve().parent
 SCRIPTS = HERE.parent
@@ -149,21 +149,16 @@ def identity(config: DictConfig) -> dict[str, float | str]:
     }
 
 
-def differences(
+def changed_entries(
     old: Mapping[str, object], new: Mapping[str, object], ignored: Sequence[str] = ()
 ) -> list[str]:
     """What differs between two runs, in words; but for entries that are ignored.
 
     Examples:
-        >>> differences({"tau": 0.5, "a.b": 1}, {"tau": 0.1}, ignored=["a"])
+        >>> changed_entries({"tau": 0.5, "a.b": 1}, {"tau": 0.1}, ignored=["a"])
         ['tau was 0.5, is 0.1']
     """
-    return [
-        f"{name} was {old.get(name, 'absent')}, is {new.get(name, 'absent')}"
-        for name in sorted(old.keys() | new.keys())
-        if name not in old or name not in new or old[name] != new[name]
-        if not _is_below(name, ignored)
-    ]
+    return [words for name, words in differences(old, new).items() if not _is_below(name, ignored)]
 
 
 def _is_below(name: str, entries: Iterable[str]) -> bool:

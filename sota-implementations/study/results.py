@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from manifest import SCRIPTS, Cell, differences
+from manifest import SCRIPTS, Cell, changed_entries
 from records import Record
 
 RESULTS = SCRIPTS / "results"
@@ -71,7 +71,7 @@ class Results:
         """
         # A cell has one configuration but for the seed, after which the bandit's instance is named.
         config = {k: value for k, value in record.identity.items() if not k.endswith("seed")}
-        changes = differences(self.configs.get(cell.name, config), config, ignored)
+        changes = changed_entries(self.configs.get(cell.name, config), config, ignored)
         if changes:
             print(
                 f"{self.directory.name}: results of {cell.name} are dropped, for "

@@ -25,7 +25,7 @@ from manifest import (
     add_ignored,
     add_selection,
     argument_parser,
-    differences,
+    changed_entries,
     read_manifests,
 )
 from records import find_record
@@ -59,7 +59,7 @@ class Run:
         record = find_record(self.directory)
         if record is None:
             return False
-        changes = differences(record.identity, self.cell.identity(self.seed), self.ignored)
+        changes = changed_entries(record.identity, self.cell.identity(self.seed), self.ignored)
         if changes:
             raise ValueError(
                 f"{self.directory} holds a run of another configuration: {'; '.join(changes)}. "

@@ -24,7 +24,7 @@ from torchrl.checkpoint import (
     StateDictCheckpointAdapter,
 )
 
-from torchrl_ecpo.experiment.run import Run, flatten
+from torchrl_ecpo.experiment.run import Run, differences, flatten
 
 __all__ = ["Checkpoints", "Progress"]
 
@@ -323,8 +323,7 @@ def _differences(saved: dict[str, Any], present: dict[str, Any]) -> list[str]:
         for config in (saved, present)
     )
     return [
-        f"{name} was {old.get(name, 'absent')}, is {new.get(name, 'absent')}"
-        for name in sorted(old.keys() | new.keys())
-        if name not in old or name not in new or old[name] != new[name]
+        words
+        for name, words in differences(old, new).items()
         if not (name.startswith("total_") and float(old[name]) < float(new[name]))
     ]

@@ -309,6 +309,20 @@ def flatten(config: object, prefix: str = "") -> dict[str, float | str]:
     return {prefix.removeprefix("."): config if is_plain else str(config)}
 
 
+def differences(old: Mapping[str, object], new: Mapping[str, object]) -> dict[str, str]:
+    """What differs between two flat configurations, in words, by the name of the entry.
+
+    Examples:
+        >>> differences({"tau": 0.5, "a.b": 1}, {"tau": 0.1, "a.b": 1})
+        {'tau': 'tau was 0.5, is 0.1'}
+    """
+    return {
+        name: f"{name} was {old.get(name, 'absent')}, is {new.get(name, 'absent')}"
+        for name in sorted(old.keys() | new.keys())
+        if name not in old or name not in new or old[name] != new[name]
+    }
+
+
 def _versions() -> dict[str, str]:
     versions = {"python": platform.python_version(), "platform": platform.platform()}
     for package in RECORDED_PACKAGES:
