@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import shutil
@@ -10,7 +11,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from omegaconf import OmegaConf
+from tensordict import TensorDict
 
 from torchrl_ecpo.experiment import compare, read_metrics
 
@@ -196,3 +199,32 @@ def test_bad_options_end_with_a_clear_message(tmp_path, overrides, message):
     process = start(tmp_path, *overrides)
     assert process.returncode != 0
     assert message in process.stderr
+
+
+def test_distinct_solutions_are_counted(monkeypatch):
+    monkeypatch.delitem(sys.modules, "tasks", raising=False)
+    monkeypatch.syspath_prepend(str(ECPO.parent))
+    tasks = importlib.import_module("tasks")
+    # (move, write, character) of two steps in each of four trajectories of two groups.
+    one, other, silent = [[1, 1, 3], [1, 1, 2]], [[0, 1, 3], [1, 1, 2]], [[1, 0, 0], [1, 1, 2]]
+    silent_again = [[1, 0, 4], [1, 1, 2]]  # the 4 is not written
+    action = torch.tensor([[one, one, other, other], [one, silent, silent_again, [one[0]] * 2]])
+    reward = torch.tensor([[[1.0, 1.0]] * 4, [[1.0, 1.0]] * 3 + [[2.0, 0.0]]])
+    done = torch.tensor([False, True]).expand(2, 4, 2).clone()
+    done[1, 3] = True  # ends with its first step
+    reward[0, 3, 1] = -0.5  # fails
+    is_first = torch.tensor([True, False])
+    groups = TensorDict(
+        {
+            "action": action,
+            "attainable": torch.full((2, 4, 2), 2.0),
+            "collector": {"mask": ~done.roll(1, 2) | is_first},
+            "next": {"reward": reward.unsqueeze(-1), "done": done.unsqueeze(-1)},
+        },
+        batch_size=[2, 4, 2],
+    )
+    # First group: one (twice) and other; second: one, silent (twice), and the short one.
+    assert tasks.distinct_solutions(groups) == (2 + 3) / 2
+    groups["next", "reward"].zero_()
+    assert tasks.distinct_solutions(groups) == 0
+    sys.modules.pop("tasks")

@@ -55,7 +55,7 @@ class Task:
     measure: Callable[[TensorDictBase], Metrics]
     """What a batch of groups ``[num_groups, group_size, T]`` tells beside the loss."""
     evaluate: Callable[[TensorDictBase], Metrics]
-    """Measures the actor as it stands; the last batch says how difficult a problem should be."""
+    """Measures the actor as it stands, or what takes long to measure of the last batch."""
     shown: Sequence[str]
     """Metrics on the progress bar and in the picture."""
     evaluation_env: EnvBase | None = None
@@ -126,6 +126,7 @@ def make_algorithmic(config: DictConfig) -> Task:
         return {
             "greedy_return": _returns(episodes).mean(),
             "greedy_attained": _returns(episodes).sum() / episodes["attainable"][..., 0].sum(),
+            "distinct_solutions": distinct_solutions(groups),
         }
 
     shown = ("return", "level", "attained", "entropy", "ESS")
@@ -192,6 +193,23 @@ def _greedy(env: EnvBase, actor: ProbabilisticTensorDictSequential) -> TensorDic
     """One whole episode in each row, with the most probable actions."""
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         return env.rollout(10_000, actor, break_when_any_done=False, break_when_all_done=True)
+
+
+def distinct_solutions(groups: TensorDictBase) -> float:
+    """In how many different ways a group solves its algorithmic task, mean over the groups.
+
+    Ways differ in moves, in when something is written, or in what; a character that is not written
+    makes no difference.
+    """
+    group_size = groups.shape[1]
+    solved = (_returns(groups) >= groups["attainable"][..., 0]).flatten()
+    action = groups["action"].flatten(0, 1)[solved]
+    is_written = torch.ones_like(action, dtype=torch.bool)
+    is_written[..., 2] = action[..., 1] == 1
+    is_real = groups["collector", "mask"].flatten(0, 1)[solved].unsqueeze(-1)
+    ways = action.where(is_real & is_written, -1).flatten(1)
+    group = solved.nonzero() // group_size
+    return len(torch.cat([group, ways], 1).unique(dim=0)) / len(groups)
 
 
 def _returns(episodes: TensorDictBase) -> Tensor:

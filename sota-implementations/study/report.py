@@ -35,6 +35,7 @@ METRIC_LABELS = {
     "expected_reward": "expected reward",
     "evaluation_return": "return",
     "ESS": "effective sample size",
+    "distinct_solutions": "distinct solutions of a group",
 }
 SCORES = ("runs", "area", "final", "solved", "steps to solve")
 INTRODUCTION = """# The study
