@@ -408,9 +408,11 @@ def test_results_stay_unless_a_run_went_further_or_the_cell_has_changed(
     path = plan(tmp_path, counter, s={})
     make_runs(run, path)
     first = collect(study, tmp_path, path)
+    files = {file: file.read_text() for file in first.directory.iterdir()}
     empty = tmp_path / "empty"
     empty.mkdir()
     assert collect(study, tmp_path, path, str(empty)) == first
+    assert {file: file.read_text() for file in first.directory.iterdir()} == files
     make_runs(run, plan(tmp_path, counter, s={"steps": 6, "seeds": "1"}))
     longer = collect(study, tmp_path, path)
     assert longer.runs["one", "A", "", 1]["reached"] == "6"

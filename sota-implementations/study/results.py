@@ -43,8 +43,7 @@ class Results:
         runs = {_key(row): row for row in _read_csv(directory / "runs.csv")}
         points = _read_csv(directory / "curves.csv")
         curves = {
-            key: [{k: float(v) for k, v in row.items() if k not in KEYS and v} for row in rows]
-            for key, rows in itertools.groupby(points, _key)
+            key: [_point(row) for row in rows] for key, rows in itertools.groupby(points, _key)
         }
         return cls(directory, runs, curves, json.loads((directory / "configs.json").read_text()))
 
@@ -134,6 +133,11 @@ def thin(columns: Mapping[str, Sequence[float]], metrics: Sequence[str], steps: 
 
 def _key(row: Mapping[str, str]) -> Key:
     return row["task"], row["method"], row["setting"], int(row["seed"])
+
+
+def _point(row: Mapping[str, str]) -> Point:
+    metrics = {k: float(v) for k, v in row.items() if k not in (*KEYS, "step") and v}
+    return {"step": int(row["step"]), **metrics}
 
 
 def _read_csv(path: Path) -> list[dict[str, str]]:
