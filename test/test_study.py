@@ -248,6 +248,53 @@ def test_what_is_done_is_skipped_and_more_seeds_are_taken_on(run, tmp_path, coun
     assert "done  one/A/seed 3" in run(path, "--dry-run")[1]
 
 
+def test_seeds_are_stacked_and_what_has_begun_goes_on_as_it_was(study, run, tmp_path, counter):
+    config = counter.parent / "config/config.yaml"
+    config.write_text(config.read_text() + "\nseeds: null\n")
+    cells = study.manifest.read_manifests([plan(tmp_path, counter, s={"seeds": "1-5"})]).select()
+    base = cells[0].directory(tmp_path)
+
+    def processes():
+        runs = study.run.planned_runs(cells, tmp_path, stack=2)
+        return {each.seeds: each.directory.name for each in runs}
+
+    assert processes() == {(1, 2): "seeds_1_2", (3, 4): "seeds_3_4", (5,): "seed_5"}
+    (base / "seeds_2_4_7").mkdir(parents=True)
+    (base / "seed_5").mkdir()
+    assert processes() == {(2, 4, 7): "seeds_2_4_7", (1, 3): "seeds_1_3", (5,): "seed_5"}
+    stack, *_ = study.run.planned_runs(cells, tmp_path, stack=2)
+    assert stack.command[2:6] == ["name=one", "speed=1.0", "seeds=[1,3]", "total_frames=4"]
+
+
+def test_a_stack_is_made_continued_and_collected(study, run, tmp_path):
+    options = "env.num_actions=30 group_size=5 optim.lr=0.1"
+    cell = {"tasks": ["small"], "methods": {"ECPO": options}, "seeds": "1-3"}
+    task = {"script": "ecpo/ecpo.py", "options": "env=bandit", "metric": "expected_reward"}
+    path = tmp_path / "manifest.yaml"
+
+    def make(steps, *more):
+        content = {"tasks": {"small": task | {"steps": steps}}, "studies": {"s": {"title": "s"}}}
+        content["studies"]["s"] |= cell
+        path.write_text(yaml.safe_dump(content))
+        return run(path, "--stack", "2", *more)
+
+    status, output = make(50)
+    assert status == 0, output
+    assert "3 runs in 2 processes" in output
+    assert "small/ECPO/seed 1, 2 in " in output
+    assert "3 of 3 runs are done, 0 failed" in output
+    assert make(50)[1].count("is done") == 2
+    assert make(100)[0] == 0
+    results = collect(study, tmp_path, path)
+    assert [key[-1] for key in results.runs] == [1, 2, 3]
+    assert all(row["reached"] == "100" for row in results.runs.values())
+    (stack,) = (tmp_path / "runs").rglob("seeds_1_2")
+    summary = json.loads((stack / "seed_2/summary.json").read_text())
+    assert summary["stack_size"] == 2
+    row = results.runs["small", "ECPO", "", 2]
+    assert float(row["seconds"]) == pytest.approx(summary["seconds"] / 2, abs=0.06)
+
+
 def test_a_run_that_two_studies_ask_for_is_made_once_and_as_long_as_the_longer(
     run, tmp_path, counter
 ):
@@ -445,7 +492,7 @@ def synthetic(study, tmp_path, counter, curves, steps=100, **entries):
                 metrics={"step": at, "return": slope * at / steps},
                 unit="frames",
                 finished=True,
-                summary={"seconds": 90},
+                seconds=90,
                 versions={"torch": "2"},
             )
             results.add(cell, record, ["return"])
@@ -509,7 +556,7 @@ def test_a_heat_map_and_a_ranking(study, tmp_path, counter):
         for value, cell in enumerate(manifest.cells(entry)[:3]):
             record = SimpleNamespace(
                 **{"identity": {}, "seed": 1, "reached": 100, "unit": "frames", "finished": True},
-                **{"summary": {}, "versions": {}, "metrics": {"step": [100], "return": [value]}},
+                **{"seconds": None, "versions": {}, "metrics": {"step": [100], "return": [value]}},
             )
             results.add(cell, record, ["return"])
         results.write()

@@ -71,7 +71,8 @@ def make_stack(config: DictConfig) -> Parts:
     for index, (own, each) in enumerate(zip(configs, tasks, strict=True)):
         directory = Path(f"seed_{own.seed}")
         directory.mkdir(exist_ok=True)
-        runs.append(make_run(own, each, directory=directory, show_bar=index == 0))
+        options = {"directory": directory, "show_bar": index == 0, "stack_size": len(tasks)}
+        runs.append(make_run(own, each, **options))
     run = RunStack(runs)
     return Parts(task, collector, loss_module, temperatures, run, loss_module.clip_grad_norm_)
 

@@ -117,10 +117,9 @@ class Cell:
         config.seed = seed
         return identity(config)
 
-    def directory(self, runs: Path, seed: int) -> Path:
-        """Where the queue makes a run: cells of several studies share those that are the same."""
-        slug = re.sub(r"[^\w.,+~-]+", "-", ",".join(self.options))
-        return runs / self.task.name / slug / f"seed_{seed}"
+    def directory(self, runs: Path) -> Path:
+        """Where the queue makes its runs; cells that are the same share it."""
+        return runs / self.task.name / re.sub(r"[^\w.,+~-]+", "-", ",".join(self.options))
 
 
 @cache

@@ -55,6 +55,13 @@ class Record:
         return _read_json(self.path / "summary.json")
 
     @property
+    def seconds(self) -> float | None:
+        """How long it took, of stacked runs its share; None before its end."""
+        if "seconds" not in self.summary:
+            return None
+        return round(self.summary["seconds"] / self.summary.get("stack_size", 1), 1)
+
+    @property
     def versions(self) -> dict[str, str]:
         """Of the packages it was made with."""
         return _read_json(self.path / "versions.json")

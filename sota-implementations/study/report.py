@@ -49,7 +49,7 @@ Every run, figure and table here follows from
 
 ```bash
 make study                                      # the runs; goes on where it was stopped
-make study ARGS='--only figure1 --seeds 1-10'   # some of them
+make study ARGS='--only figure1 --seeds 1-10 --stack 5'   # some of them, five in one process
 make report RUNS=runs/study                     # take their results in, and write this page
 make report                                     # write it from the committed results
 ```
@@ -61,6 +61,7 @@ How to read the tables:
 - **final**: mean of the metric over the last tenth of the run. Both with standard error over runs.
 - **solved**: share of runs that reached the threshold, on average over a hundredth of the run.
 - **steps to solve**: median over all runs; "> 240,000" if half of the runs or more never did.
+- **minutes a run**: of wall-clock time; of runs in one process, a share.
 - Figures show the mean over runs and its standard error; the legend has the number of runs.
 - Intervals are 95 % intervals of a stratified bootstrap, by
   [rliable](https://github.com/google-research/rliable). The interquartile mean (IQM) is the mean of

@@ -89,7 +89,7 @@ class Results:
             "reached": record.reached,
             "unit": record.unit,
             "finished": record.finished,
-            "seconds": record.summary.get("seconds", ""),
+            "seconds": "" if record.seconds is None else record.seconds,
             **record.versions,
         }
         self.runs[key] = {name: str(value) for name, value in values.items()}

@@ -2,6 +2,8 @@
 
 ``python run.py --only figure1 --tasks copy,reverse --seeds 1-3``. What is done is skipped. Ctrl-C
 or SIGTERM lets each run write a checkpoint; the same command goes on from there, also after a kill.
+``--stack 5`` makes up to five runs of a cell in one process, where the script can. Runs that have
+begun go on as they were begun.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import fcntl
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -28,7 +31,7 @@ from manifest import (
     changed_entries,
     read_manifests,
 )
-from records import find_record
+from records import Record, find_record
 
 POLL = 0.2  # seconds
 LOG_LINES = 12
@@ -38,16 +41,25 @@ ENVIRONMENT = {"OMP_NUM_THREADS": "1", "MUJOCO_GL": "disabled"}
 
 @dataclass(frozen=True)
 class Run:
-    """A run that the manifest asks for."""
+    """A run that the manifest asks for, or stacked ones, which a process makes together."""
 
     cell: Cell
-    seed: int
+    seeds: tuple[int, ...]
     directory: Path
     ignored: Sequence[str] = ()
 
     def __str__(self) -> str:
         """For messages."""
-        return f"{self.cell.name}/seed {self.seed}"
+        return f"{self.cell.name}/seed {', '.join(map(str, self.seeds))}"
+
+    @property
+    def records(self) -> dict[int, Record]:
+        """What is there of each seed."""
+        places = {self.seeds[0]: self.directory}
+        if len(self.seeds) > 1:
+            places = {seed: self.directory / f"seed_{seed}" for seed in self.seeds}
+        found = {seed: find_record(place) for seed, place in places.items()}
+        return {seed: record for seed, record in found.items() if record is not None}
 
     @property
     def is_done(self) -> bool:
@@ -56,18 +68,20 @@ class Run:
         Raises:
             ValueError: if the directory holds a run of another configuration.
         """
-        record = find_record(self.directory)
-        if record is None:
-            return False
-        changes = changed_entries(record.identity, self.cell.identity(self.seed), self.ignored)
-        if changes:
-            raise ValueError(
-                f"{self.directory} holds a run of another configuration: {'; '.join(changes)}. "
-                "Remove it, give another directory with --runs, or, if that makes no difference, "
-                "--ignore these entries."
-            )
-        is_complete = record.finished or record.total > self.cell.steps
-        return is_complete and record.reached >= self.cell.steps
+        records = self.records
+        for seed, record in records.items():
+            changes = changed_entries(record.identity, self.cell.identity(seed), self.ignored)
+            if changes:
+                raise ValueError(
+                    f"{self.directory} holds a run of another configuration: {'; '.join(changes)}. "
+                    "Remove it, give another directory with --runs, or, if that makes no "
+                    "difference, --ignore these entries."
+                )
+        return len(records) == len(self.seeds) and all(
+            (record.finished or record.total > self.cell.steps)
+            and record.reached >= self.cell.steps
+            for record in records.values()
+        )
 
     @property
     def command(self) -> list[str]:
@@ -75,36 +89,67 @@ class Run:
 
         When a run finished it left out its replay buffer; with one, a longer run begins anew.
         """
-        record = find_record(self.directory)
-        is_over = (
-            record is not None
-            and record.finished
-            and record.total < self.cell.steps
-            and "replay_buffer" in record.config
+        records = self.records.values()
+        is_over = any(
+            record.finished and record.total < self.cell.steps and "replay_buffer" in record.config
+            for record in records
         )
-        steps = self.cell.steps if record is None else max(record.total, self.cell.steps)
+        steps = max([self.cell.steps, *(record.total for record in records)])
+        seeds = f"seed={self.seeds[0]}"
+        if len(self.seeds) > 1:
+            seeds = f"seeds={list(self.seeds)}".replace(" ", "")
         return [
-            *(sys.executable, str(self.cell.script), *self.cell.options, f"seed={self.seed}"),
+            *(sys.executable, str(self.cell.script), *self.cell.options, seeds),
             f"{self.cell.total_option}={steps}",
             f"hydra.run.dir='{self.directory}'",
             f"resume={'null' if is_over else 'auto'}",
         ]
 
 
-def planned_runs(cells: Sequence[Cell], directory: Path, ignored: Sequence[str] = ()) -> list[Run]:
+def planned_runs(
+    cells: Sequence[Cell], directory: Path, ignored: Sequence[str] = (), stack: int = 1
+) -> list[Run]:
     """Every run once, by seed first: a study that is stopped early has something of each cell."""
-    runs = [
-        Run(cell, seed, cell.directory(directory, seed), ignored)
-        for cell in cells
-        for seed in cell.seeds
-    ]
+    wanted: dict[Path, dict[int, Cell]] = {}
+    for cell in cells:
+        by_seed = wanted.setdefault(cell.directory(directory), {})
+        for seed in cell.seeds:
+            if seed not in by_seed or by_seed[seed].steps < cell.steps:
+                by_seed[seed] = cell
+    runs = []
+    for base, by_seed in wanted.items():
+        size = stack if "seeds" in next(iter(by_seed.values())).config else 1
+        for seeds in partition(list(by_seed), begun(base), size):
+            longest = max((by_seed[s] for s in seeds if s in by_seed), key=lambda cell: cell.steps)
+            kind = "seed" if len(seeds) == 1 else "seeds"
+            runs.append(Run(longest, seeds, base / "_".join([kind, *map(str, seeds)]), ignored))
     places = {seed: place for cell in cells for place, seed in enumerate(cell.seeds)}
-    unique: dict[Path, Run] = {}
-    for run in sorted(runs, key=lambda run: places[run.seed]):
-        same = unique.setdefault(run.directory, run)
-        if run.cell.steps > same.cell.steps:
-            unique[run.directory] = run
-    return list(unique.values())
+    return sorted(runs, key=lambda run: min(places[s] for s in run.seeds if s in places))
+
+
+def begun(base: Path) -> list[tuple[int, ...]]:
+    """The seeds of each process that has a directory: ``seed_1``, or ``seeds_1_2`` for a stack."""
+    if not base.is_dir():
+        return []
+    names = (re.fullmatch(r"seeds?_(\d+(?:_\d+)*)", path.name) for path in sorted(base.iterdir()))
+    return [tuple(map(int, name[1].split("_"))) for name in names if name]
+
+
+def partition(
+    seeds: Sequence[int], begun: Sequence[tuple[int, ...]], size: int
+) -> list[tuple[int, ...]]:
+    """The seeds of each process: of those that have begun the same, of others `size`.
+
+    Examples:
+        >>> partition([1, 2, 3, 4, 5, 6], begun=[(2,), (4, 5)], size=2)
+        [(2,), (4, 5), (1, 3), (6,)]
+    """
+    parts, left = [], list(seeds)
+    for own in begun:
+        if set(own) & set(left):
+            parts.append(own)
+            left = [seed for seed in left if seed not in own]
+    return parts + [tuple(left[i : i + size]) for i in range(0, len(left), size)]
 
 
 @dataclass
@@ -127,9 +172,9 @@ class Queue:
 
     def __init__(self, runs: Sequence[Run], workers: int) -> None:
         self.waiting, self.jobs = deque(runs), list[Job]()
-        self.total, self.workers = len(runs), workers
+        self.total, self.workers = sum(len(run.seeds) for run in runs), workers
         self.done = 0
-        self.failures: dict[str, str] = {}
+        self.failures: list[tuple[Run, str]] = []
         self.stopped_by: signal.Signals | None = None
         self._signals = 0
 
@@ -205,11 +250,11 @@ class Queue:
             self._fail(job.run, f"status {status}, {job.run.directory}/log.txt ends:\n{last}")
 
     def _report(self, what: str, run: Run, more: str = "") -> None:
-        self.done += 1
+        self.done += len(run.seeds)
         print(f"{what:9} {run}{more} ({self.done} of {self.total})", flush=True)
 
     def _fail(self, run: Run, why: str) -> None:
-        self.failures[str(run)] = why
+        self.failures.append((run, why))
         print(f"failed    {run}", flush=True)
 
 
@@ -230,14 +275,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--runs", type=Path, default=Path("runs/study"), help="directory of runs")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     parser.add_argument("--workers", type=int, default=cores, help="runs at a time")
+    parser.add_argument("--stack", type=int, default=1, help="runs of a cell in one process")
     parser.add_argument("--dry-run", action="store_true", help="list the runs")
     options = parser.parse_args(arguments)
-    if options.workers < 1:
-        parser.error(f"--workers must be at least 1, got {options.workers}")
+    for name in ("workers", "stack"):
+        if getattr(options, name) < 1:
+            parser.error(f"--{name} must be at least 1, got {getattr(options, name)}")
     try:
         manifest = read_manifests(options.manifest)
         cells = manifest.select(options.only, options.tasks, options.methods, options.seeds)
-        runs = planned_runs(cells, options.runs.resolve(), options.ignore)
+        runs = planned_runs(cells, options.runs.resolve(), options.ignore, options.stack)
         for cell in cells:
             assert cell.config, "composed once before anything is run, so that a mistake shows"
     except (ValueError, OSError) as error:
@@ -246,12 +293,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for run in runs:
             print(f"{'done' if run.is_done else 'to do'}  {run}  {run.directory}")
         return 0
-    print(f"{len(runs)} runs, {options.workers} at a time, in {options.runs.resolve()}", flush=True)
     queue = Queue(runs, options.workers)
+    processes = f"{queue.total} runs in {len(runs)} processes, {options.workers} at a time"
+    print(f"{processes}, in {options.runs.resolve()}", flush=True)
     queue.work()
-    for name, why in queue.failures.items():
-        print(f"\n{name}: {why}")
-    print(f"\n{queue.done} of {queue.total} runs are done, {len(queue.failures)} failed.")
+    for run, why in queue.failures:
+        print(f"\n{run}: {why}")
+    failed = sum(len(run.seeds) for run, _ in queue.failures)
+    print(f"\n{queue.done} of {queue.total} runs are done, {failed} failed.")
     if queue.stopped_by is not None:
         print(f"Stopped by {queue.stopped_by.name}; the same command goes on.")
         return 128 + queue.stopped_by

@@ -168,6 +168,7 @@ class Run:
         shown: metrics that the progress bar shows, and the picture, a panel each.
         directory: where to write; defaults to the working directory.
         show_bar: whether there is a progress bar; default True.
+        stack_size: number of runs that share the process, for the summary; default 1.
 
     Raises:
         ValueError: for an unknown backend.
@@ -183,12 +184,14 @@ class Run:
         shown: Sequence[str],
         directory: Path | str = ".",
         show_bar: bool = True,
+        stack_size: int = 1,
     ) -> None:
         backend = config.logger.backend or "none"
         if backend not in BACKENDS:
             raise ValueError(f"logger.backend must be one of {BACKENDS}, got {backend!r}.")
         self.name, self.unit, self.shown = name, unit, shown
         self.directory = Path(directory).resolve()
+        self.stack_size = stack_size
         self.step = 0
         self._latest: dict[str, float] = {}
         OmegaConf.save(config, self.directory / "config.yaml", resolve=True)
@@ -286,6 +289,7 @@ class Run:
         summary = {
             "finished": error is None,
             "seconds": round(time.monotonic() - self._started, 1),
+            "stack_size": self.stack_size,
             self.unit: self.step,
             **{k: value if math.isfinite(value) else None for k, value in self._latest.items()},
         }
