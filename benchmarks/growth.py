@@ -24,19 +24,18 @@ import torch
 from actor_critic import configure, make_parts, random_batch
 from csv_table import add_csv_option, write_csv
 from ecac import total  # pyright: ignore[reportMissingImports]
+from loop import NUM_OBSERVATIONS, NVEC, TAU, TAU_PRIME
 from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_ecpo import ECPOLoss
 from torchrl_ecpo.modules import make_tuple_policy
 
-NUM_OBSERVATIONS, NVEC = 3, (2, 2, 2)  # of Reverse
-
 
 def ecpo(G: int, K: int, T: int) -> Callable[[], Tensor]:
     """The loss of a batch of random observations and actions."""
     actor = make_tuple_policy(NUM_OBSERVATIONS, NVEC)
-    loss_module = ECPOLoss(actor, tau=0.5, tau_prime=0.01)
+    loss_module = ECPOLoss(actor, tau=TAU, tau_prime=TAU_PRIME)
     never = torch.zeros(G, K, T, 1, dtype=torch.bool)
     is_init = never.clone()
     is_init[:, :, 0] = True
