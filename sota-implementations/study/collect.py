@@ -11,7 +11,14 @@ import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from manifest import Cell, add_ignored, argument_parser, changed_entries, read_manifests
+from manifest import (
+    Cell,
+    add_ignored,
+    add_studies,
+    argument_parser,
+    changed_entries,
+    read_manifests,
+)
 from records import Record, find_records
 from results import RESULTS, Results
 
@@ -40,6 +47,7 @@ def nearest(record: Record, cells: Iterable[Cell]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Collect, and say what was found; return the exit status."""
     parser = argument_parser(__doc__)
+    add_studies(parser)
     add_ignored(parser)
     parser.add_argument("directories", nargs="*", type=Path, default=[Path("runs/study")])
     parser.add_argument("--results", type=Path, default=RESULTS)

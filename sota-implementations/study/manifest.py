@@ -374,8 +374,12 @@ def argument_parser(description: str | None) -> argparse.ArgumentParser:
     """A parser of what queue, collection and report have in common."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--manifest", type=Path, nargs="+", default=MANIFESTS)
-    parser.add_argument("--only", type=_names, default=[], help="studies: figure1,figure2")
     return parser
+
+
+def add_studies(parser: argparse.ArgumentParser) -> None:
+    """Let a user choose among the studies."""
+    parser.add_argument("--only", type=_names, default=[], help="studies: figure1,figure2")
 
 
 def add_ignored(parser: argparse.ArgumentParser) -> None:
@@ -400,7 +404,8 @@ def _seeds(given: str) -> tuple[int, ...]:
 
 
 def add_selection(parser: argparse.ArgumentParser) -> None:
-    """Let a user choose among the runs of a study, too."""
+    """Let a user choose among the studies, and among the runs of each."""
+    add_studies(parser)
     parser.add_argument("--tasks", type=_names, default=[], help="copy,reverse")
     parser.add_argument("--methods", type=_names, default=[], help="ECPO,UREX")
     parser.add_argument("--seeds", type=_seeds, default=(), help="1-3,7")

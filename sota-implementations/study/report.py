@@ -428,19 +428,16 @@ def recorded_section(recorded: Recorded, manifest: Manifest, results: Path) -> s
     return "\n\n".join([f"## {recorded.title}", recorded.about, text])
 
 
-def write_report(manifest: Manifest, results: Path, docs: Path, only: Sequence[str] = ()) -> Path:
+def write_report(manifest: Manifest, results: Path, docs: Path) -> Path:
     """Write page and figures; return the page.
 
     Args:
         manifest: what was planned.
         results: the folder with what was collected.
         docs: where the page goes and, in ``figures/study``, its pictures.
-        only: studies to which the page is limited.
     """
     sections, waiting = [], []
     for study in manifest.studies.values():
-        if only and study.name not in only:
-            continue
         collected = Results.read(results / "study" / study.name)
         cells = [read_cell(cell, collected) for cell in manifest.cells(study)]
         if any(result.runs for result in cells):
@@ -462,7 +459,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--docs", type=Path, default=DOCS)
     options = parser.parse_args(arguments)
     manifest = read_manifests(options.manifest)
-    print(write_report(manifest, options.results, options.docs, options.only))
+    print(write_report(manifest, options.results, options.docs))
     return 0
 
 
