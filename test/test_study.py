@@ -176,6 +176,7 @@ def test_a_choice_of_studies_tasks_methods_and_seeds(study, tmp_path, counter):
         ({"seeds": [1, 1]}, "study s: Seeds must be there, and none twice"),
         ({"tasks": ["three"]}, r"study s: tasks: unknown \['three'\]; there are \['one'\]"),
         ({"kind": "map"}, "study s: kind must be one of .*'heat_map'.*, got 'map'"),
+        ({"rank_by": "best"}, "study s: rank_by must be one of .*'final'.*, got 'best'"),
         ({"kind": "heat_map"}, "study s: a heat map needs a grid of two axes"),
         ({"methods": {"A": ["x=1"]}}, "method A must be options of the script, or a mapping"),
         ({"scale_by": "Z"}, r"study s: scale_by: unknown \['Z'\]"),
@@ -549,14 +550,16 @@ def test_a_heat_map_and_a_ranking(study, tmp_path, counter):
         counter,
         map={"methods": {"A": grid}, "kind": "heat_map", "steps": 100},
         search={"methods": {"A": grid}, "kind": "ranking", "steps": 100},
+        by_final={"methods": {"A": grid}, "kind": "ranking", "rank_by": "final", "steps": 100},
     )
     manifest = study.manifest.read_manifests([path])
     for name, entry in manifest.studies.items():
         results = study.results.Results(tmp_path / "results/study" / name)
         for value, cell in enumerate(manifest.cells(entry)[:3]):
+            metrics = {"step": [50, 100], "return": [10 * (2 - value), value]}
             record = SimpleNamespace(
                 **{"identity": {}, "seed": 1, "reached": 100, "unit": "frames", "finished": True},
-                **{"seconds": None, "versions": {}, "metrics": {"step": [100], "return": [value]}},
+                **{"seconds": None, "versions": {}, "metrics": metrics},
             )
             results.add(cell, record, ["return"])
         results.write()
@@ -564,6 +567,8 @@ def test_a_heat_map_and_a_ranking(study, tmp_path, counter):
     assert {"map_one_a.svg", "map_one_a.png"} <= files.keys()
     best = "speed 2, size 3: 2.0 (1 of 2 runs) | speed 1, size 4: 1.000 (1 of 2 runs)"
     assert f"| one | A | 3 of 4 | {best} | speed 1, size 3: 0.000 (1 of 2 runs) |" in text
+    best = "speed 1, size 3: 10.0 (1 of 2 runs) | speed 1, size 4: 5.5 (1 of 2 runs)"
+    assert f"| one | A | 3 of 4 | {best} | speed 2, size 3: 1.000 (1 of 2 runs) |" in text
     assert "| one | A | 4 | 100 | **3 of 8 planned** | 1 |" in text
 
 

@@ -25,6 +25,7 @@ HERE = Path(__file__).resolve().parent
 SCRIPTS = HERE.parent
 MANIFESTS = [HERE / "study.yaml", HERE / "search.yaml"]
 KINDS = ("curves", "heat_map", "ranking")
+RANKS = ("area", "final")
 # Runs that differ in these alone have the same numbers, as far as both go: the entries of env are
 # those that other entries are read from.
 NOT_THE_RUN = (
@@ -65,6 +66,8 @@ class Study:
     seeds: tuple[int, ...]
     about: str = ""
     kind: str = "curves"
+    rank_by: str = "area"
+    """Of a ranking: the score by which settings are ordered."""
     steps: int | None = None
     """Instead of the task's."""
     also: tuple[str, ...] = ()
@@ -165,23 +168,11 @@ def _is_below(name: str, entries: Iterable[str]) -> bool:
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """Curves that ``torchrl_ecpo.experiment.compare`` wrote, of runs that no queue made."""
-
-    name: str
-    title: str
-    files: Mapping[str, str]
-    """By task, below ``results``."""
-    about: str = ""
-
-
-@dataclass(frozen=True)
 class Manifest:
     """What one or several files say, by name."""
 
     tasks: dict[str, Task] = dataclasses.field(default_factory=dict)
     studies: dict[str, Study] = dataclasses.field(default_factory=dict)
-    recorded: dict[str, Recorded] = dataclasses.field(default_factory=dict)
 
     def cells(self, study: Study) -> list[Cell]:
         """All cells of a study, task by task."""
@@ -295,11 +286,6 @@ def read_manifests(paths: Sequence[Path] = MANIFESTS) -> Manifest:
         for name, entry in content.get("studies", {}).items():
             study = _read_study(f"{path}, study {name}", name, entry, manifest.tasks)
             _add(manifest.studies, path, study)
-        for name, entry in content.get("recorded", {}).items():
-            where = f"{path}, recorded {name}"
-            recorded = _read(Recorded, where, name, entry)
-            _check_names(f"{where}, files", recorded.files, manifest.tasks)
-            _add(manifest.recorded, path, recorded)
     return manifest
 
 
@@ -332,6 +318,8 @@ def _read_study(where: str, name: str, entry: object, tasks: Mapping[str, Task])
         raise ValueError(f"{where}: {error}") from error
     if study.kind not in KINDS:
         raise ValueError(f"{where}: kind must be one of {KINDS}, got {study.kind!r}.")
+    if study.rank_by not in RANKS:
+        raise ValueError(f"{where}: rank_by must be one of {RANKS}, got {study.rank_by!r}.")
     if study.steps is not None:
         _check_steps(where, study.steps)
     for method, plan in study.methods.items():

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import csv
 import statistics
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -14,7 +13,7 @@ from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
-from manifest import SCRIPTS, Cell, Manifest, Recorded, Study, argument_parser, read_manifests
+from manifest import SCRIPTS, Cell, Manifest, Study, argument_parser, read_manifests
 from results import RESULTS, Point, Results
 from scores import (
     Estimate,
@@ -285,17 +284,19 @@ def _interval(estimate: Estimate) -> str:
     return f"{estimate.value:.2f} ({estimate.low:.2f} to {estimate.high:.2f})"
 
 
-def ranking(cells: Sequence[CellResult]) -> str:
+def ranking(study: Study, cells: Sequence[CellResult]) -> str:
     """The best settings of each method on each task."""
+    score = {"area": area, "final": final}[study.rank_by]
     rows = []
     for group in groups_of(cells):
-        have_runs = [result for result in group if len(result.finals)]
-        best = sorted(have_runs, key=lambda result: -result.finals.mean())[:BEST]
-        listed = [f"{r.cell.label}: {with_error(r.finals)} ({r.count} runs)" for r in best]
-        listed += [""] * (BEST - len(best))
-        searched = f"{len(have_runs)} of {len(group)}"
-        rows.append([group[0].title, group[0].cell.method, searched, *listed])
-    return table(("task", "method", "settings run", "best", "second", "third"), rows)
+        scored = [(score(*result.scored), result) for result in group if result.scored]
+        scored.sort(key=lambda pair: -pair[0].mean())
+        best = [f"{r.cell.label}: {with_error(s)} ({r.count} runs)" for s, r in scored[:BEST]]
+        best += [""] * (BEST - len(best))
+        searched = f"{len(scored)} of {len(group)}"
+        rows.append([group[0].title, group[0].cell.method, searched, *best])
+    headings = ("task", "method", "settings run", f"best {study.rank_by}", "second", "third")
+    return table(headings, rows)
 
 
 def groups_of(cells: Iterable[CellResult]) -> list[list[CellResult]]:
@@ -398,34 +399,13 @@ def section(study: Study, cells: Sequence[CellResult], docs: Path) -> str:
     elif study.kind == "heat_map":
         parts = [heat_maps(study, cells, docs)]
     else:
-        parts, runs = [ranking(cells)], search_table(cells)
+        parts, runs = [ranking(study, cells)], search_table(cells)
     source = (
         f"The runs, by `make study ARGS='--only {study.name}'`; each with its time and versions, "
         "the curves and the whole configuration of each cell are in "
         f"[`results/study/{study.name}`](../sota-implementations/results/study/{study.name}):"
     )
     return "\n\n".join(filter(None, [f"## {study.title}", study.about, *parts, source, runs]))
-
-
-def recorded_section(recorded: Recorded, manifest: Manifest, results: Path) -> str:
-    """Scores of curves that are there already."""
-    rows = []
-    for name, file in recorded.files.items():
-        task = manifest.tasks[name]
-        with (results / file).open(newline="") as lines:
-            points = list(csv.DictReader(lines))
-        for method in dict.fromkeys(point["method"] for point in points):
-            runs: dict[str, list[tuple[float, float]]] = {}
-            for point in points:
-                if point["method"] == method:
-                    pair = (float(point["step"]), float(point[task.metric]))
-                    runs.setdefault(point["run"], []).append(pair)
-            curve = align([np.array(run) for run in runs.values()])
-            assert curve is not None
-            row = scores(str(len(runs)), curve, task.solved)
-            rows.append([task.title or name, method, f"{curve[0][-1]:,.0f}", *row])
-    text = table(("task", "method", "steps", *SCORES), rows)
-    return "\n\n".join([f"## {recorded.title}", recorded.about, text])
 
 
 def write_report(manifest: Manifest, results: Path, docs: Path) -> Path:
@@ -444,7 +424,6 @@ def write_report(manifest: Manifest, results: Path, docs: Path) -> Path:
             sections.append(section(study, cells, docs))
         else:
             waiting.append(f"- {study.title} (`{study.name}`)")
-    sections += [recorded_section(r, manifest, results) for r in manifest.recorded.values()]
     if waiting:
         sections.append("## Without a complete run yet\n\n" + "\n".join(waiting))
     page = docs / "study.md"
