@@ -30,13 +30,12 @@ PAGES_WITH_DEFAULTS = [
 ECPO_CONFIG = ROOT / "sota-implementations/ecpo/config"
 ECAC_CONFIG = ROOT / "sota-implementations/ecac/config"
 MUJOCO_TASKS = ("hopper", "walker2d", "halfcheetah", "ant", "humanoid")
-EASIER_TASKS = ("copy", "duplicated_input", "repeat_copy", "reverse")
+ALGORITHMIC_TASKS = ("copy", "duplicated_input", "repeat_copy", "reverse", "reversed_addition")
+TITLES = ("Copy", "DuplicatedInput", "RepeatCopy", "Reverse", "ReversedAddition")
 # Second column of a table of defaults: the configurations that it speaks of. They are those of the
 # loss of that name, or else of the loss that the page is named after, or else of ECPO.
 STATED_FOR = {
-    "algorithmic tasks": (ECPO_CONFIG, (*EASIER_TASKS, "reversed_addition")),
-    "all but ReversedAddition": (ECPO_CONFIG, EASIER_TASKS),
-    "ReversedAddition": (ECPO_CONFIG, ("reversed_addition",)),
+    "algorithmic tasks": (ECPO_CONFIG, ALGORITHMIC_TASKS),
     "bandit": (ECPO_CONFIG, ("bandit",)),
     "gymnasium": (ECPO_CONFIG, ("gym",)),
     "MuJoCo tasks": (ECAC_CONFIG, MUJOCO_TASKS),
@@ -148,6 +147,27 @@ def test_stated_defaults_are_those_of_the_configuration(page):
             value = OmegaConf.select(config, option, throw_on_resolution_failure=True)
             value = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
             assert value == yaml.safe_load(stated), f"{option} with env={task}"
+
+
+def test_the_settings_that_the_search_chose_are_those_of_the_configuration():
+    text = (DOCS / "algorithms/index.md").read_text()
+    optimisers = dict(re.findall(r"\*\*(\w+)\*\*: .*`(optim\.amsgrad=\S+ optim\.eps=\S+)`", text))
+    assert set(optimisers) == {"batch", "group"}
+    for task, title in zip(ALGORITHMIC_TASKS, TITLES, strict=True):
+        stated = {
+            option: values
+            for option, *values in re.findall(
+                rf"^\| {title} \| `(\S+)` \| `(\S+)` \| `(\S+)` \| `(\S+)` \|$", text, re.MULTILINE
+            )
+        }
+        assert set(stated) == {"env.curriculum", "loss.tau"}
+        for place, loss in enumerate(("ecpo", "urex", "ment")):
+            config = composed(ECPO_CONFIG, (f"env={task}", f"loss={loss}"))
+            for option, values in stated.items():
+                assert str(OmegaConf.select(config, option)) == values[place], (task, loss)
+            asked = OmegaConf.from_dotlist(optimisers[config.env.curriculum].split())
+            assert config.optim.amsgrad == asked.optim.amsgrad
+            assert config.optim.eps == asked.optim.eps
 
 
 def test_the_page_of_equations_names_tests_that_exist():
