@@ -124,7 +124,7 @@ def test_the_study_is_what_was_planned(study):
     assert runs["figure3_left"] == 2 * 5 * 10
     reported = {s for name in ("figure1", "figure2") for s in manifest.studies[name].seeds}
     searches = [entry for name, entry in manifest.studies.items() if name.startswith("search")]
-    assert len(searches) == 5
+    assert len(searches) == 6
     for search in searches:
         assert not reported & set(search.seeds), "searched on the reported seeds"
         cells = [(cell.task.name, cell.method) for cell in manifest.cells(search)]
