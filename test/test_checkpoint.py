@@ -193,7 +193,7 @@ def cut_record(directory):
         (truncate_manifest, (), "nothing to resume from, for .*checkpoints holds no checkpoint"),
         (make_foreign, (), "checkpoint-0*20 is no checkpoint of a run of this script"),
         (cut_record, (), "metrics.csv does not reach to step 20"),
-        (None, ("loss.tau=1", "seed=7"), r"loss.tau was \S+, is 1; seed was 0, is 7. Resume with"),
+        (None, ("loss.tau=1", "seed=7"), "loss.tau was 0.01, is 1; seed was 0, is 7. Resume with"),
         (None, ("resume=elsewhere",), "resume=elsewhere is not this run's directory"),
         (None, ("resume=null", "checkpoint.keep=0"), "checkpoint.keep must be an integer of at"),
         (None, ("resume=null", "checkpoint.interval=-1"), "checkpoint.interval must be seconds"),

@@ -30,8 +30,13 @@ PAGES_WITH_DEFAULTS = [
 ECPO_CONFIG = ROOT / "sota-implementations/ecpo/config"
 ECAC_CONFIG = ROOT / "sota-implementations/ecac/config"
 MUJOCO_TASKS = ("hopper", "walker2d", "halfcheetah", "ant", "humanoid")
-ALGORITHMIC_TASKS = ("copy", "duplicated_input", "repeat_copy", "reverse", "reversed_addition")
-TITLES = ("Copy", "DuplicatedInput", "RepeatCopy", "Reverse", "ReversedAddition")
+ALGORITHMIC_TASKS = {
+    "copy": "Copy",
+    "duplicated_input": "DuplicatedInput",
+    "repeat_copy": "RepeatCopy",
+    "reverse": "Reverse",
+    "reversed_addition": "ReversedAddition",
+}
 # Second column of a table of defaults: the configurations that it speaks of. They are those of the
 # loss of that name, or else of the loss that the page is named after, or else of ECPO.
 STATED_FOR = {
@@ -153,7 +158,7 @@ def test_the_settings_that_the_search_chose_are_those_of_the_configuration():
     text = (DOCS / "algorithms/index.md").read_text()
     optimisers = dict(re.findall(r"\*\*(\w+)\*\*: .*`(optim\.amsgrad=\S+ optim\.eps=\S+)`", text))
     assert set(optimisers) == {"batch", "group"}
-    for task, title in zip(ALGORITHMIC_TASKS, TITLES, strict=True):
+    for task, title in ALGORITHMIC_TASKS.items():
         stated = {
             option: values
             for option, *values in re.findall(
