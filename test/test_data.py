@@ -63,6 +63,13 @@ class TestPack:
         assert_close(unpack_groups(groups), steps, rtol=0, atol=0)
         assert_close(pack_groups(unpack_groups(groups)), groups, rtol=0, atol=0)
 
+    def test_trailing_dimension_of_ids(self):
+        steps = make_steps(TRAJECTORIES)
+        expected = pack_groups(steps).exclude(("collector", "traj_ids"))
+        steps["collector", "traj_ids"] = steps["collector", "traj_ids"].unsqueeze(-1)
+        packed = pack_groups(steps).exclude(("collector", "traj_ids"))
+        assert_close(packed, expected, rtol=0, atol=0)
+
     def test_interleaved_trajectories_and_groups(self):
         steps = make_steps([(1, 2), (0, 3), (1, 1), (0, 1)])
         shuffled = steps[torch.tensor([2, 0, 6, 3, 5, 1, 4])]  # in time order within each
@@ -141,6 +148,14 @@ class TestPack:
         holes["collector", "mask"][0, 0, 0] = False
         with pytest.raises(ValueError, match="holes"):
             pack_groups(holes)
+        empty = groups.clone()
+        empty["collector", "mask"][0, 0] = False
+        with pytest.raises(ValueError, match="1 trajectories have no real step"):
+            pack_groups(empty)
+        with pytest.raises(ValueError, match="got no steps"):
+            pack_groups(groups[..., :0])
+        with pytest.raises(ValueError, match=r"boolean.*got torch.float32"):
+            pack_groups(groups.clone().set(("collector", "mask"), torch.ones(3, 2, 4)))
         mixed = groups.clone()
         mixed["group"][0, 1] = 4
         with pytest.raises(ValueError, match=re.escape("groups [4, 5]")):
@@ -251,6 +266,8 @@ class TestSampler:
             other.load_state_dict(buffer.state_dict())
         for _ in range(3):
             assert_close(buffer.sample(), other.sample())
+        with pytest.raises(ValueError, match=r"group_size=2, this one has group_size=3"):
+            TrajectoryGroupSampler(group_size=3).load_state_dict(buffer.sampler.state_dict())
         for b in (buffer, other):
             fill(b, 20)
         ready = sorted(buffer.sampler._members)

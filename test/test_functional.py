@@ -318,7 +318,9 @@ def test_theorem1_temperatures_by_hand():
         assert tau > 0
         assert_close(tau_prime**2 * horizon * math.log(n), 1.0)
         assert_close((tau + tau_prime) ** 2 * 2 * math.log(n) / horizon, 1.0)
-    assert theorem1_temperatures(1, 10)[0] == 0
+    # At T = 1 the formula has tau < 0. The sum is kept.
+    tau, tau_prime = theorem1_temperatures(1, 10)
+    assert_close((tau, tau_prime), (0.0, (2 * math.log(10)) ** -0.5))
 
 
 # ------------------------------------------------------------------------------ exact enumeration

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 
 import pytest
 import torch
@@ -41,7 +42,8 @@ class Loss(LossModule):
     ],
 )
 def test_values_at_start_half_end_and_after(schedule, expected):
-    assert [schedule(count) for count in (0, 5, 10, 1_000)] == pytest.approx(expected, rel=1e-12)
+    for each in (schedule, pickle.loads(pickle.dumps(schedule))):
+        assert [each(count) for count in (0, 5, 10, 1_000)] == pytest.approx(expected, rel=1e-12)
 
 
 def test_linear_ends_at_exactly_its_end():

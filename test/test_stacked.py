@@ -13,11 +13,12 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
-from torchrl.envs import TransformedEnv
+from tensordict import TensorDict
+from torchrl.envs import InitTracker, TransformedEnv
 
 from torchrl_ecpo.envs import AlgorithmicEnv, BanditEnv, stack_envs
 from torchrl_ecpo.experiment import Checkpoints, Run, read_metrics
-from torchrl_ecpo.modules import make_tuple_policy, stack_policies
+from torchrl_ecpo.modules import make_softmax_policy, make_tuple_policy, stack_policies
 from torchrl_ecpo.modules.histories import distinct_histories
 
 SCRIPT = Path(__file__).parents[1] / "sota-implementations/ecpo"
@@ -205,3 +206,23 @@ def test_policies_see_their_part_of_the_stacked_parameters():
             whole.mul_(2)
     for actor, old in zip(actors, before, strict=True):
         assert all(a.equal(2 * b) for a, b in zip(actor.parameters(), old, strict=True))
+
+
+def _softmax_policies():
+    return [make_softmax_policy(torch.eye(3)) for _ in range(2)], TensorDict(batch_size=4)
+
+
+def _tuple_policies():
+    policies = [make_tuple_policy(num_observations=6, nvec=(2, 2, 5)) for _ in range(2)]
+    env = TransformedEnv(AlgorithmicEnv("copy", num_groups=2, group_size=2), InitTracker())
+    return policies, env.reset().reshape(4)
+
+
+@pytest.mark.parametrize("make", [_softmax_policies, _tuple_policies])
+def test_rows_must_come_run_after_run(make):
+    """Otherwise a run would get the actions of another."""
+    policies, batch = make()
+    stacked = stack_policies(policies, [torch.get_rng_state()] * 2)
+    with pytest.raises(ValueError, match=r"run after run, got 'run' = \[0, 1, 0, 1\]"):
+        stacked(batch.set("run", torch.tensor([0, 1, 0, 1])))
+    assert stacked(batch.set("run", torch.tensor([0, 0, 1, 1])))["action"].shape[0] == 4

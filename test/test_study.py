@@ -124,11 +124,17 @@ def test_the_study_is_what_was_planned(study):
     assert runs["figure3_left"] == 2 * 5 * 10
     reported = {s for name in ("figure1", "figure2") for s in manifest.studies[name].seeds}
     searches = [entry for name, entry in manifest.studies.items() if name.startswith("search")]
-    assert len(searches) == 6
+    assert len(searches) == 8
     for search in searches:
         assert not reported & set(search.seeds), "searched on the reported seeds"
         cells = [(cell.task.name, cell.method) for cell in manifest.cells(search)]
         assert len({cells.count(cell) for cell in cells}) == 1, "the search is not equal"
+    methods: dict[tuple[str, str], int] = {}
+    for cell in (cell for search in searches for cell in manifest.cells(search)):
+        if cell.task.script.startswith("ecpo"):
+            methods[cell.task.name, cell.method] = methods.get((cell.task.name, cell.method), 0) + 1
+    for task in {task for task, _ in methods}:
+        assert len({n for (name, _), n in methods.items() if name == task}) == 1, task
 
 
 @pytest.mark.slow

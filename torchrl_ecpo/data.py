@@ -158,13 +158,14 @@ def _integer_entry(data: TensorDictBase, key: NestedKey, reader: str) -> Tensor:
     return value
 
 
-def _done(data: TensorDictBase, done_key: NestedKey) -> Tensor | None:
-    done = data.get(done_key, None)
-    return None if done is None else done.reshape(data.shape)
+def _per_step(data: TensorDictBase, key: NestedKey) -> Tensor | None:
+    """An entry of one number a step, with or without a trailing dimension of 1."""
+    value = data.get(key, None)
+    return None if value is None else value.reshape(data.shape)
 
 
 def _mask_from_done(data: TensorDictBase, done_key: NestedKey, traj_key: NestedKey) -> Tensor:
-    done, trajectory = _done(data, done_key), data.get(traj_key, None)
+    done, trajectory = _per_step(data, done_key), _per_step(data, traj_key)
     if done is None:
         return torch.ones(data.shape, dtype=torch.bool, device=data.device)
     mask = (done.cumsum(-1) - done.long()) == 0
@@ -182,7 +183,14 @@ def _mask_from_done(data: TensorDictBase, done_key: NestedKey, traj_key: NestedK
 def _check_padded(mask: Tensor, group: Tensor, shape: torch.Size) -> None:
     if mask.shape != shape:
         raise ValueError(f"The mask must have the shape {tuple(shape)}, got {tuple(mask.shape)}.")
-    if not mask[..., 0].all() or (mask[..., 1:] & ~mask[..., :-1]).any():
+    if mask.dtype != torch.bool:
+        raise ValueError(f"The mask must be boolean (True: the step is real), got {mask.dtype}.")
+    if not mask.numel():
+        raise ValueError(f"pack_groups got no steps: data of shape {tuple(shape)}.")
+    if not mask.any(-1).all():
+        empty = int((~mask.any(-1)).sum())
+        raise ValueError(f"{empty} trajectories have no real step. Drop them, or their groups.")
+    if (mask[..., 1:] & ~mask[..., :-1]).any():
         raise ValueError("The mask has holes: trajectories are padded at their end, nowhere else.")
     mixed = (mask & (group != group[..., :1])).any(-1)
     if mixed.any():
@@ -209,7 +217,7 @@ def _find_trajectories(
     data: TensorDictBase, group: Tensor, traj_key: NestedKey, done_key: NestedKey
 ) -> tuple[Tensor | None, Tensor, Tensor]:
     """Return the order that makes trajectories contiguous (None: as is), starts, lengths `[N]`."""
-    done, trajectory = _done(data, done_key), data.get(traj_key, None)
+    done, trajectory = _per_step(data, done_key), _per_step(data, traj_key)
     if not group.numel():
         raise ValueError("pack_groups got no steps.")
     if done is None and trajectory is None:
@@ -527,7 +535,7 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
                 f"trajectory ends; found {_names(data)}."
             )
         group = _integer_entry(data, self.group_key, type(self).__name__)
-        trajectory = data.get(self.traj_key, None)
+        trajectory = _per_step(data, self.traj_key)
         index = index.to(group.device)
         return (
             group[index].cpu(),
@@ -673,6 +681,7 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
             [item for pool in self._members.values() for item in pool.items], dtype=torch.long
         )
         return {
+            "group_size": self.group_size,
             "start": start,
             "length": self._length[start],
             "group": self._group[start],
@@ -686,7 +695,16 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
+        """Restore what :meth:`state_dict` returned.
+
+        Raises:
+            ValueError: if it is that of a sampler of groups of another size.
+        """
+        if state_dict["group_size"] != self.group_size:
+            raise ValueError(
+                f"The state is that of a sampler with group_size={state_dict['group_size']}, this "
+                f"one has group_size={self.group_size}."
+            )
         self._empty()
         self._allocate(state_dict["max_size"])
         self._register(*(state_dict[key] for key in ("start", "length", "group")))

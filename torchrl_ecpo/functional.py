@@ -698,8 +698,8 @@ def theorem1_temperatures(horizon: float, num_trajectories: int) -> tuple[float,
         num_trajectories: n, how many trajectories there are; at least 2.
 
     Returns:
-        (tau, tau_prime), for rewards in [0, 1]. tau is not below 0, which the formula is for
-        T = 1; the reference is then the uniform start, on which the lift does not depend.
+        (tau, tau_prime), for rewards in [0, 1]. Where the formula has tau < 0, at T = 1, it is 0
+        and tau_prime the whole sum, on which alone the lift of the uniform start depends.
 
     Raises:
         ValueError: if ``horizon`` < 1 or ``num_trajectories`` < 2.
@@ -714,8 +714,9 @@ def theorem1_temperatures(horizon: float, num_trajectories: int) -> tuple[float,
     if not 2 <= num_trajectories < math.inf:
         raise ValueError(f"num_trajectories must be at least 2 and finite, got {num_trajectories}.")
     log_n = math.log(num_trajectories)
-    tau_prime = 1 / math.sqrt(horizon * log_n)
-    return max(math.sqrt(horizon / (2 * log_n)) - tau_prime, 0.0), tau_prime
+    total = math.sqrt(horizon / (2 * log_n))
+    tau_prime = min(1 / math.sqrt(horizon * log_n), total)
+    return total - tau_prime, tau_prime
 
 
 # -------------------------------------------------------------------------------- masked algebra

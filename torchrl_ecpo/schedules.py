@@ -7,6 +7,7 @@ project steps, lifts or trajectories; :class:`TemperatureScheduler` counts what 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from torchrl.objectives import LossModule
@@ -33,7 +34,7 @@ def constant(value: float) -> Schedule:
         >>> constant(0.5)(1_000)
         0.5
     """
-    return lambda count: value
+    return partial(_linear, start=value, end=value, duration=1.0)
 
 
 def linear(start: float, end: float, duration: float) -> Schedule:
@@ -48,12 +49,7 @@ def linear(start: float, end: float, duration: float) -> Schedule:
         [0.02, 0.01, 0.0, 0.0]
     """
     _check_duration(duration)
-
-    def schedule(count: float) -> float:
-        progress = min(count / duration, 1.0)
-        return (1 - progress) * start + progress * end
-
-    return schedule
+    return partial(_linear, start=start, end=end, duration=duration)
 
 
 def exponential(start: float, end: float, duration: float) -> Schedule:
@@ -73,7 +69,7 @@ def exponential(start: float, end: float, duration: float) -> Schedule:
             f"An exponential schedule needs start > 0 and end > 0, got {start} and {end}. "
             "Use a linear one to reach 0."
         )
-    return lambda count: start * (end / start) ** min(count / duration, 1.0)
+    return partial(_exponential, start=start, end=end, duration=duration)
 
 
 def theorem1_schedules(num_trajectories: int, *, horizon: int | None = None) -> dict[str, Schedule]:
@@ -87,15 +83,12 @@ def theorem1_schedules(num_trajectories: int, *, horizon: int | None = None) -> 
     Examples:
         >>> schedules = theorem1_schedules(10)
         >>> [round(schedules["tau_prime"](count), 3) for count in (0, 99)]
-        [0.659, 0.066]
+        [0.466, 0.066]
     """
-
-    def temperature(index: int) -> Schedule:
-        return lambda count: theorem1_temperatures(
-            count + 1 if horizon is None else horizon, num_trajectories
-        )[index]
-
-    return {"tau": temperature(0), "tau_prime": temperature(1)}
+    return {
+        name: partial(_theorem1, index=index, num_trajectories=num_trajectories, horizon=horizon)
+        for index, name in enumerate(("tau", "tau_prime"))
+    }
 
 
 def make_schedule(setting: float | Mapping[str, Any]) -> Schedule:
@@ -143,6 +136,7 @@ class TemperatureScheduler:
 
     Raises:
         ValueError: if the loss has no schedulable temperature of that name.
+        AttributeError: if the loss learns it.
 
     Examples:
         >>> import torch
@@ -194,6 +188,23 @@ class TemperatureScheduler:
         """Continue at a saved count, and write its temperatures."""
         self.count = state_dict["count"]
         self._write()
+
+
+# Functions of the module, so that schedules can be pickled.
+
+
+def _linear(count: float, start: float, end: float, duration: float) -> float:
+    progress = min(count / duration, 1.0)
+    return (1 - progress) * start + progress * end
+
+
+def _exponential(count: float, start: float, end: float, duration: float) -> float:
+    return start * (end / start) ** min(count / duration, 1.0)
+
+
+def _theorem1(count: float, index: int, num_trajectories: int, horizon: int | None) -> float:
+    lift = count + 1 if horizon is None else horizon
+    return theorem1_temperatures(lift, num_trajectories)[index]
 
 
 def _check_duration(duration: float) -> None:

@@ -157,21 +157,11 @@ def make_loss(config: DictConfig, actor: TensorDictModuleBase, env: EnvBase) -> 
         options["noise_clip"] *= _half_range(action_spec)
     loss_module = LOSSES[config.loss.name](actor, *critics, **options)
     loss_module.make_value_estimator(gamma=config.gamma)
-    _call_each_qvalue(loss_module)
-    return loss_module
-
-
-def _call_each_qvalue(loss_module: Any) -> None:
-    """Let the losses with one set of inputs for all Q networks call :meth:`DenseNetwork.each`.
-
-    It takes the place of vmap. (TorchRL's own replacement, ``deactivate_vmap``, copies and stacks
-    the inputs too; the numbers are the same.)
-    """
     if isinstance(loss_module, SACLoss):
+        # In the place of vmap, as in our own losses; the numbers are the same. (TorchRL's own
+        # replacement, deactivate_vmap, copies and stacks the inputs too.)
         loss_module._vmap_qnetworkN0 = loss_module.qvalue_network.each
-    elif isinstance(loss_module, ECACLoss | PMDACLoss):
-        loss_module._vmap_qvalue = loss_module.qvalue_network.each
-        loss_module.deactivate_vmap = False
+    return loss_module
 
 
 def make_temperatures(config: DictConfig, loss_module: LossModule) -> TemperatureScheduler:

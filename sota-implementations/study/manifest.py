@@ -27,10 +27,11 @@ MANIFESTS = [HERE / "study.yaml", HERE / "search.yaml"]
 KINDS = ("curves", "heat_map", "ranking")
 RANKS = ("area", "final")
 # Runs that differ in these alone have the same numbers, as far as both go: the entries of env are
-# those that other entries are read from.
+# those that other entries are read from, the last is how Q networks are called.
 NOT_THE_RUN = (
     *("resume", "checkpoint", "logger", "threads", "compile"),
     *("env.settings", "env.optim", "env.cracked", "env.evaluation_interval"),
+    "loss.options.deactivate_vmap",
 )
 
 Entry = TypeVar("Entry")

@@ -8,9 +8,11 @@ import pytest
 import torch
 from torch.distributions import (
     AffineTransform,
+    Bernoulli,
     Beta,
     Categorical,
     Independent,
+    IndependentTransform,
     MultivariateNormal,
     Normal,
     OneHotCategorical,
@@ -43,6 +45,10 @@ GAUSSIAN = {
     "tanh": lambda loc, scale: TanhNormal(loc, scale),
     "bounded": lambda loc, scale: TanhNormal(loc, scale, low=-2.0, high=3.0),
     "torch_bounded": _torch_tanh,
+    "joint_tanh": lambda loc, scale: TransformedDistribution(
+        Independent(Normal(loc, scale), 1),
+        [IndependentTransform(TanhTransform(), 1), AffineTransform(0.5, 2.5, event_dim=1)],
+    ),
 }
 gaussian = pytest.mark.parametrize("kind", GAUSSIAN)
 
@@ -65,6 +71,7 @@ def test_samples_are_those_of_the_policy(kind, dtype):
         "tanh": actions.latent.tanh(),
         "bounded": 0.5 + 2.5 * actions.latent.tanh(),
         "torch_bounded": 0.5 + 2.5 * actions.latent.tanh(),
+        "joint_tanh": 0.5 + 2.5 * actions.latent.tanh(),
     }.get(kind, actions.latent)
     assert_close(actions.action, expected)
 
@@ -137,6 +144,7 @@ def test_policies_that_are_no_diagonal_gaussians(name):
         (OneHotCategorical(logits=LOC), True),
         (TorchRLOneHotCategorical(logits=LOC), True),
         (MaskedCategorical(logits=LOC, mask=torch.ones(3, 2, dtype=torch.bool)), True),
+        (Bernoulli(logits=LOC), False),  # n coins are not one of n
         *((make(LOC, SCALE), False) for make in GAUSSIAN.values()),
         *((policy, False) for policy in OTHERS.values()),
     ],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import pickle
 import warnings
 from copy import deepcopy
 
@@ -27,16 +28,25 @@ from actor_critic_problems import (
     total,
 )
 from tensordict import TensorDict, TensorDictParams
-from tensordict.nn import TensorDictModule
+from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
 from torch import nn
+from torch.distributions import Bernoulli, Categorical, Normal
 from torch.testing import assert_close
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import ExplorationType, MultiStepTransform, set_exploration_type
 from torchrl.envs.utils import exploration_type
-from torchrl.modules import MLP, ValueOperator
+from torchrl.modules import (
+    MLP,
+    LSTMModule,
+    MaskedCategorical,
+    MaskedOneHotCategorical,
+    ProbabilisticActor,
+    ValueOperator,
+    set_recurrent_mode,
+)
 from torchrl.objectives import LossModule, SoftUpdate, ValueEstimators
-from torchrl.objectives.value import TD0Estimator
-from trajectory_problems import MASK, OBSERVATION
+from torchrl.objectives.value import GAE, TD0Estimator
+from trajectory_problems import MASK, OBSERVATION, make_actor
 
 from torchrl_ecpo import (
     ContinuousActorCriticLoss,
@@ -838,6 +848,117 @@ def test_input_is_untouched_but_for_the_priority(case, value):
     assert (priority > 0).all()
 
 
+# ----------------------------------------------------------------------------------------- copies
+
+
+@losses
+@with_and_without_value
+def test_pickle_and_deepcopy(case, value):
+    """The copy gives the same numbers, and shares nothing with the original."""
+    loss = case.build(value=value, **LEARNED)
+    batch = _batch(case)
+    expected = call(loss, batch)
+    for copy in (deepcopy(loss), pickle.loads(pickle.dumps(loss))):
+        assert_close(call(copy, batch), expected)
+        own = {id(module) for module in loss.modules()}
+        assert not own & {id(module) for module in copy.modules()}
+        with torch.no_grad():
+            for parameter in copy.parameters():
+                parameter.fill_(0.1)
+        assert not torch.equal(call(copy, batch)["loss_qvalue"], expected["loss_qvalue"])
+        assert_close(call(loss, batch), expected)
+
+
+def test_dropout_of_a_copy_is_its_own():
+    """A copy calls its own Q network, not the original's."""
+    networks = make_networks("tanh_normal")
+    size = OBSERVATION + ACTION
+    network = MLP(in_features=size, out_features=1, num_cells=[8], dropout=0.5)
+    networks.qvalues = ValueOperator(network, ["observation", "action"]).double()
+    copy = deepcopy(CASES["ecac"].build(networks))
+    copy.set_vmap_randomness("different")
+    batch = _batch(CASES["ecac"])
+    chosen = [copy._chosen_qvalue(batch) for _ in range(2)]
+    assert not torch.equal(*chosen)
+    copy.qvalue_network.eval()
+    chosen = [copy._chosen_qvalue(batch) for _ in range(2)]
+    assert torch.equal(*chosen)
+
+
+@continuous
+def test_recurrent_q_network(case):
+    """Of sampled actions it gives what it gives of those that were taken: rows stay rows."""
+    size = OBSERVATION + ACTION
+    memory = LSTMModule(input_size=size, hidden_size=4, in_key="both", out_key="memory")
+    networks = make_networks(case.kind)
+    networks.qvalues = TensorDictSequential(
+        TensorDictModule(lambda *x: torch.cat(x, -1), ["observation", "action"], ["both"]),
+        memory,
+        TensorDictModule(nn.Linear(4, 1), ["memory"], ["state_action_value"]),
+    ).double()
+    loss = case.build(networks, deactivate_vmap=True, delay_qvalue=False)
+    batch = _batch(case, 3, 5)
+    states = torch.randn(2, 3, 5, 1, 4, generator=torch.Generator().manual_seed(0)).double()
+    batch["recurrent_state_h"], batch["recurrent_state_c"] = states
+    batch["is_init"] = torch.zeros(3, 5, 1, dtype=torch.bool)
+    with set_recurrent_mode(True):
+        chosen = loss._chosen_qvalue(batch).amin(0)
+        actions = batch["action"].expand(4, 3, 5, ACTION)
+        of_samples = loss._qvalue_of(batch, actions, loss.qvalue_network_params)
+    assert_close(of_samples, chosen.expand(4, 3, 5))
+
+
+# ----------------------------------------------------------------------------- masks of actions
+
+
+@pytest.mark.parametrize("distribution", [MaskedCategorical, MaskedOneHotCategorical])
+@pytest.mark.parametrize("name", ["discrete_ecac", "discrete_pmd_ac"])
+@pytest.mark.parametrize("tau", [0.75, 0.0])
+def test_forbidden_actions_have_no_part(distribution, name, tau):
+    """All numbers and gradients are those of a problem without the forbidden action."""
+    case = CASES[name]
+    forbidden, rest = CHOICES - 1, slice(CHOICES - 1)
+    allowed = torch.arange(CHOICES) != forbidden
+    networks = make_networks("categorical")
+    head = TensorDictModule(nn.Linear(OBSERVATION, CHOICES), ["observation"], ["logits"])
+    smaller = TensorDictModule(nn.Linear(OBSERVATION, forbidden), ["observation"], ["logits"])
+    qvalues = [make_qvalue("categorical").double() for _ in range(2)]
+    for whole, part in ((head, smaller),):
+        for key, value in whole.named_parameters():
+            part.get_parameter(key).data = value.data[rest].clone()
+    masked = ProbabilisticActor(
+        head,
+        {"logits": "logits", "mask": "action_mask"},
+        distribution_class=distribution,
+    ).double()
+    plain = ProbabilisticActor(smaller, ["logits"], distribution_class=Categorical).double()
+    fewer = [deepcopy(network) for network in qvalues]
+    for network in fewer:
+        last = [module for module in network.modules() if isinstance(module, nn.Linear)][-1]
+        last.weight.data, last.bias.data = last.weight.data[rest], last.bias.data[rest]
+
+    batch = _batch(case)
+    one_hot = torch.eye(CHOICES)[torch.arange(6) % forbidden]
+    batch["action"] = one_hot
+    for where in (batch, batch["next"]):
+        where["action_mask"] = allowed.expand(6, CHOICES)
+    options = {"tau": tau, "delay_actor": False}
+    results = []
+    for actor, critics, action in ((masked, qvalues, one_hot), (plain, fewer, one_hot[:, rest])):
+        networks.actor, networks.qvalues = actor, critics
+        loss = case.build(networks, **options)
+        outputs = call(loss, batch.clone().set("action", action))
+        results.append((outputs, gradients(loss, total(outputs))))
+    (actual, gradient), (expected, of_fewer) = results
+    for key in ("loss_actor", "loss_qvalue", "kl_target", "kl_to_reference", "entropy", "ESS"):
+        assert_close(actual[key], expected[key], msg=key)
+    assert_close(actual["state_value"], expected["state_value"])
+    for key, value in of_fewer.items():
+        if key.endswith("weight") and "actor" in key:
+            assert_close(gradient[key][rest], value)
+            assert (gradient[key][forbidden] == 0).all()
+
+
 # ------------------------------------------------------------------------------ masks and weights
 
 
@@ -912,7 +1033,8 @@ def test_mask_can_be_ignored_or_renamed(case):
     loss.loss_mask_key = None
     assert_close(call(loss, batch), plain)
     loss.loss_mask_key = "valid"
-    assert_close(call(loss, batch), plain)
+    with pytest.raises(KeyError, match="'valid' is missing"):
+        call(loss, batch)
     batch["valid"] = batch[MASK]
     assert_close(call(loss, batch), masked)
 
@@ -1002,6 +1124,53 @@ def test_estimators_of_the_advantage_are_refused(case, estimator):
     """They need a value network of the policy."""
     with pytest.raises(NotImplementedError, match="not implemented for loss"):
         case.build().make_value_estimator(estimator)
+
+
+@losses
+@pytest.mark.parametrize(
+    ("estimator", "options"),
+    [(ValueEstimators.TD1, {}), (ValueEstimators.TDLambda, {"lmbda": 0.6})],
+    ids=["td1", "td_lambda"],
+)
+def test_returns_end_with_what_is_real(case, estimator, options):
+    """Targets of padded trajectories are those of the same without padding, also of cut ones."""
+    batch = _batch(case, 3, 6)
+    for key in ("done", "terminated"):
+        batch["next", key].zero_()
+    lengths = (4, 6, 1)
+    values = torch.randn(3, 6, generator=torch.Generator().manual_seed(3)).double()
+    mask = torch.arange(6) < torch.tensor(lengths).unsqueeze(-1)
+    loss = _fixed_next_value(case, case.build().double(), batch, values)
+    loss.make_value_estimator(estimator, gamma=GAMMA, **options)
+    loss.double()
+    batch[MASK] = mask
+    padded = loss.soft_bellman_target(loss._read(batch)[0])
+    for n, length in enumerate(lengths):
+        row = batch[n : n + 1, :length].exclude(MASK)
+        _fixed_next_value(case, loss, row, values[n : n + 1, :length])
+        assert_close(padded[n, :length], loss.soft_bellman_target(row)[0])
+
+
+@losses
+def test_value_estimators_that_are_no_use(case):
+    """The loss has a soft value of its own, and needs no more than that."""
+    loss = case.build()
+    network = ValueOperator(nn.Linear(OBSERVATION, 1), ["observation"])
+    with pytest.raises(ValueError, match="TD0Estimator must have value_network=None"):
+        loss.make_value_estimator(TD0Estimator(gamma=GAMMA, value_network=network))
+    with pytest.raises(NotImplementedError, match=r"GAE is not implemented.*takes TD0Estimator"):
+        loss.make_value_estimator(GAE(gamma=GAMMA, lmbda=0.9, value_network=None))
+
+
+@losses
+def test_value_estimator_of_the_users_reads_the_keys_of_the_loss(case):
+    batch = _batch(case)
+    expected = call(case.build(), batch)
+    loss = case.build()
+    loss.set_keys(reward="r")
+    batch["next"].rename_key_("reward", "r")
+    loss.make_value_estimator(TD0Estimator, gamma=GAMMA, value_network=None)
+    assert_close(call(loss.double(), batch), expected)
 
 
 @losses
@@ -1307,9 +1476,10 @@ def test_learned_temperatures_settle_where_the_constraints_hold(case):
 def test_action_space_of_another_kind(case):
     """Both ways, at the door, naming the twin."""
     other = make_networks("tanh_normal" if case.is_discrete else "categorical")
-    kinds = ("discrete", "continuous") if case.is_discrete else ("continuous", "discrete")
+    kinds = ["one of n actions", "actions with rsample"]
+    own, twins = kinds if case.is_discrete else reversed(kinds)
     message = (
-        f"{case.loss.__name__} is for {kinds[0]} actions.*over {kinds[1]} ones: "
+        rf"{case.loss.__name__} is for policies over {own}.*, got \w+. For those over {twins}.*, "
         f"use {case.loss._twin}"
     )
     with pytest.raises(ValueError, match=message):
@@ -1317,6 +1487,72 @@ def test_action_space_of_another_kind(case):
     twin = {base.__name__: base for base in (c.loss for c in CASES.values())}[case.loss._twin]
     other_base = ContinuousActorCriticLoss if case.is_discrete else DiscreteActorCriticLoss
     assert issubclass(twin, other_base)
+
+
+@losses
+def test_policies_of_neither_kind(case):
+    """Several coins are not one of n actions, and cannot be drawn by rsample either."""
+    network = TensorDictModule(nn.Linear(OBSERVATION, CHOICES), ["observation"], ["logits"])
+    coins = ProbabilisticActor(network, ["logits"], distribution_class=Bernoulli).double()
+    for actor, name in ((coins, "Bernoulli"), (make_actor("composite"), "CompositeDistribution")):
+        networks = make_networks(case.kind)
+        networks.actor = actor
+        message = f"{case.loss.__name__} is for policies over.*got {name}"
+        with pytest.raises(ValueError, match=message):
+            case.build(networks)(_batch(case))
+
+
+@losses
+def test_entries_of_the_wrong_shape(case):
+    """Named, before anything broadcasts."""
+    loss = case.build()
+    batch = _batch(case)
+    batch["next", "reward"] = batch["next", "reward"].squeeze(-1)
+    with pytest.raises(ValueError, match=r"'reward'\) must have the shape \[\*B, 1\], got \(6,\)"):
+        loss(batch)
+    for name in ("done", "terminated"):
+        batch = _batch(case)
+        batch["next", name] = batch["next", name].squeeze(-1)
+        message = rf"{name}'\) must have the shape \(6, 1\) of the reward, got \(6,\)"
+        with pytest.raises(ValueError, match=message):
+            loss(batch)
+
+
+@losses
+@with_and_without_value
+def test_networks_that_write_another_entry(case, value):
+    """TorchRL's ``ValueOperator`` does so, where the action has another name than "action"."""
+    networks = make_networks(case.kind)
+    changed = networks.value if value else networks.qvalues[1]
+    key, name = changed.out_keys[0], "value" if value else case.loss._qvalue_key
+    for network in [networks.value] if value else networks.qvalues:
+        network.out_keys[0] = "v"
+        network.module.out_keys = ["v"] if hasattr(network, "module") else None
+    loss = case.build(networks, value=value)
+    with pytest.raises(KeyError, match=rf"writes \['v'\], not '{key}'.*set_keys\({name}=...\)"):
+        loss(_batch(case))
+    loss.set_keys(**{name: "v"})
+    assert loss(_batch(case))["loss_qvalue"].isfinite()
+
+
+def test_log_probabilities_and_values_that_do_not_match():
+    networks = make_networks("tanh_normal")
+    network = TensorDictModule(
+        nn.Sequential(nn.Linear(OBSERVATION, 2 * ACTION), NormalParamExtractor()),
+        ["observation"],
+        ["loc", "scale"],
+    )
+    networks.actor = ProbabilisticActor(network, ["loc", "scale"], distribution_class=Normal)
+    networks.actor.double()
+    case = CASES["ecac"]
+    message = r"values.*shape \(1, 6\), their log-probabilities \(1, 6, 2\).*Independent"
+    with pytest.raises(ValueError, match=message):
+        case.build(networks, projection="paper")(_batch(case))
+    networks = make_networks("tanh_normal")
+    two = MLP(in_features=OBSERVATION + ACTION, out_features=2, num_cells=[5])
+    networks.qvalues = ValueOperator(two, ["observation", "action"]).double()
+    with pytest.raises(ValueError, match=r"one number, .*but the Q network writes 2"):
+        case.build(networks)(_batch(case))
 
 
 @losses
@@ -1348,7 +1584,12 @@ def test_lists_of_q_networks(case, copies, number):
     [
         ({"reduction": "bogus"}, r"reduction must be one of \('none', 'mean', 'sum'\).*'bogus'"),
         ({"loss_function": "huber"}, r"loss_function must be one of \('l2',.*got 'huber'"),
-        ({"num_actor_states": 0}, "num_actor_states must be None or at least 1.*got 0"),
+        ({"num_actor_states": 0}, "num_actor_states must be an integer of at least 1, got 0"),
+        ({"num_actor_states": 2.5}, "num_actor_states must be an integer of at least 1, got 2.5"),
+        ({"num_qvalue_nets": True}, "num_qvalue_nets must be an integer of at least 1, got True"),
+        ({"use_prioritized_weights": "yes"}, "use_prioritized_weights must be.*got 'yes'"),
+        ({"target_kl": "a"}, "target_kl must be a number, got 'a'"),
+        ({"target_entropy": [1.0]}, r"target_entropy must be a number, got \[1.0\]"),
         ({"num_actor_states": 3, "reduction": "none"}, "num_actor_states must be None.*got 3"),
         ({"target_kl": 0.0}, "target_kl must be above 0, in nats, or None, got 0.0"),
         ({"target_kl": -1.0}, "target_kl must be above 0"),
@@ -1407,8 +1648,18 @@ def test_wrong_masks(case, mask, message):
 @pytest.mark.parametrize("name", ["num_action_samples", "num_next_action_samples"])
 @pytest.mark.parametrize("value", [0, -1, 2.5, None])
 def test_number_of_samples_is_checked_at_the_door(case, name, value):
-    with pytest.raises(ValueError, match=f"{name} must be an integer of at least 1, got {value}"):
+    message = rf"{name} must be an integer of at least [12].*, got {value}"
+    with pytest.raises(ValueError, match=message):
         case.build(**{name: value})
+
+
+def test_one_sample_has_all_the_weight():
+    """It would be imitated, whatever its soft Q."""
+    with pytest.raises(
+        ValueError, match=r"num_action_samples.*at least 2: weights are relative.* 1"
+    ):
+        CASES["ecac"].build(num_action_samples=1)
+    assert CASES["pmd_ac"].build(num_action_samples=1)
 
 
 @continuous

@@ -179,6 +179,35 @@ def test_own_mask_key(case):
 
 
 @losses
+def test_mask_key_that_is_not_there(case):
+    """A mistyped key must not make padding count."""
+    loss = case.build(make_actor())
+    loss.loss_mask_key = "vaild"
+    with pytest.raises(KeyError, match="'vaild' is missing"):
+        loss(sample(make_actor(), 2, 3, 4))
+
+
+@losses
+def test_parts_of_an_action_must_all_be_named(case):
+    actor = make_actor("part_by_part")
+    loss = case.build(actor)
+    keys = ACTOR_KEYS["part_by_part"]
+    loss.set_keys(action="move", sample_log_prob=keys["sample_log_prob"])
+    with pytest.raises(ValueError, match=r"draws the parts.*'move', 'write'.*set_keys"):
+        loss(sample(actor, 2, 3, 4))
+
+
+@losses
+def test_vmap(case):
+    """Several batches at once give what each gives."""
+    actor = make_actor()
+    loss = case.build(actor)
+    batches = torch.stack([sample(actor, 2, 3, 4, seed=seed) for seed in range(4)])
+    expected = torch.stack([loss(batch)["loss_actor"] for batch in batches])
+    assert_close(torch.vmap(lambda batch: loss(batch)["loss_actor"])(batches), expected)
+
+
+@losses
 def test_no_mask_key(case):
     """loss_mask_key None: all steps count, whatever ("collector", "mask") says."""
     actor = make_actor()
@@ -628,19 +657,34 @@ BAD_BATCHES = {
     "mask of everything": (
         lambda b: b.set(MASK, torch.zeros(2, 3, 4, dtype=torch.bool)),
         ValueError,
-        r"mask.*2 group\(s\) without a single real step",
+        r"mask.*2 group\(s\) with fewer than two trajectories",
     ),
     "mask of everything, over junk": (
         lambda b: b.set(MASK, torch.zeros(2, 3, 4, dtype=torch.bool)).set(
             "observation", b["observation"] * torch.nan
         ),
         ValueError,
-        r"mask.*2 group\(s\) without a single real step",
+        r"mask.*2 group\(s\) with fewer than two trajectories",
     ),
     "mask of one group": (
         lambda b: b.set(MASK, (torch.arange(2) == 0).view(2, 1, 1).expand(2, 3, 4)),
         ValueError,
-        r"mask.*1 group\(s\) without a single real step",
+        r"mask.*1 group\(s\) with fewer than two trajectories",
+    ),
+    "mask of all but one": (
+        lambda b: b.set(MASK, (torch.arange(3) == 0).view(1, 3, 1).expand(2, 3, 4)),
+        ValueError,
+        r"mask.*2 group\(s\) with fewer than two trajectories.*Drop such groups",
+    ),
+    "mask with a hole": (
+        lambda b: b.set(MASK, (torch.arange(4) != 2).expand(2, 3, 4)),
+        ValueError,
+        r"mask.*holes in 6 trajectories: their real steps must come first",
+    ),
+    "mask with a late beginning": (
+        lambda b: b.set(MASK, (torch.arange(4) > 0).expand(2, 3, 4)),
+        ValueError,
+        r"mask.*holes in 6 trajectories",
     ),
     "NaN reward": (
         _poke(("next", "reward"), torch.nan),

@@ -74,6 +74,36 @@ def _composite() -> ProbabilisticTensorDictSequential:
     )
 
 
+class _AfterMove(nn.Module):
+    """Logits of the second part of an action, given the first."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = nn.Linear(OBSERVATION + ACTIONS, 3)
+
+    def forward(self, observation: Tensor, move: Tensor) -> Tensor:
+        first = nn.functional.one_hot(move, ACTIONS).to(observation.dtype)
+        return self.linear(torch.cat([observation, 5 * first], -1))
+
+
+def _part_by_part() -> ProbabilisticTensorDictSequential:
+    def part(name: str) -> ProbabilisticTensorDictModule:
+        return ProbabilisticTensorDictModule(
+            in_keys={"logits": f"{name}_logits"},
+            out_keys=[name],
+            distribution_class=Categorical,
+            return_log_prob=True,
+            log_prob_key=f"{name}_log_prob",
+        )
+
+    return ProbabilisticTensorDictSequential(
+        TensorDictModule(nn.Linear(OBSERVATION, ACTIONS), ["observation"], ["move_logits"]),
+        part("move"),
+        TensorDictModule(_AfterMove(), ["observation", "move"], ["write_logits"]),
+        part("write"),
+    )
+
+
 def _recurrent(
     module: type[LSTMModule] | type[GRUModule],
 ) -> ProbabilisticTensorDictSequential:
@@ -101,6 +131,7 @@ ACTORS: dict[str, Callable[[], ProbabilisticTensorDictSequential]] = {
         TanhNormal, ["loc", "scale"], nn.Linear(OBSERVATION, 4), NormalParamExtractor()
     ),
     "composite": _composite,
+    "part_by_part": _part_by_part,
     "lstm": lambda: _recurrent(LSTMModule),
     "gru": lambda: _recurrent(GRUModule),
 }
@@ -109,7 +140,11 @@ ACTOR_KEYS: dict[str, dict[str, Any]] = {
     "composite": {
         "action": [("action", "move"), "force"],
         "sample_log_prob": [("action", "move_log_prob"), "force_log_prob"],
-    }
+    },
+    "part_by_part": {
+        "action": ["move", "write"],
+        "sample_log_prob": ["move_log_prob", "write_log_prob"],
+    },
 }
 
 
@@ -169,7 +204,8 @@ def sample(actor: ProbabilisticTensorDictSequential, *shape: int, seed: int = 0)
         )
         steps = []
         for _, step in _steps(actor, batch):
-            steps.append(actor(step).exclude("logits", "loc", "scale", "params", "memory"))
+            parameters = ("logits", "move_logits", "write_logits", "loc", "scale", "params")
+            steps.append(actor(step).exclude(*parameters, "memory"))
             for key in ("recurrent_state", "recurrent_state_h", "recurrent_state_c"):
                 if ("next", key) in step.keys(True):
                     zeros = torch.zeros_like(step["next", key])
@@ -233,6 +269,13 @@ def trajectory_log_prob(actor: ProbabilisticTensorDictSequential, trajectory: Te
     """The sum over steps, one step after another, of log pi(a_t | s_t)."""
     total = torch.zeros((), dtype=next(actor.parameters()).dtype)
     for t, step in _steps(actor, trajectory):
+        if "write" in trajectory:
+            first, _, second, _ = actor.module
+            step = second(first(step).set("move", trajectory[:, t]["move"]))
+            for part in ("move", "write"):
+                dist = Categorical(logits=step[f"{part}_logits"])
+                total = total + dist.log_prob(trajectory[:, t][part])
+            continue
         dist = actor.get_dist(step)
         if isinstance(dist, CompositeDistribution):
             parts = dist.log_prob(trajectory[:, t])
@@ -248,6 +291,8 @@ def recorded_log_prob(trajectory: TensorDictBase) -> Tensor:
     log_prob = trajectory.get("action_log_prob", None)
     if log_prob is not None:
         return log_prob.sum()
+    if "write" in trajectory:
+        return (trajectory["move_log_prob"] + trajectory["write_log_prob"]).sum()
     return (trajectory["action", "move_log_prob"] + trajectory["force_log_prob"]).sum()
 
 

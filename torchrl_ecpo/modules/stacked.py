@@ -109,8 +109,15 @@ def _stack_parameters(stacked: nn.Module, modules: Sequence[nn.Module]) -> None:
 
 
 def _count(runs: Tensor, num_runs: int) -> list[int]:
-    """How many rows each run has."""
-    return runs.flatten().bincount(minlength=num_runs).tolist()
+    """How many rows each run has.
+
+    Raises:
+        ValueError: if the rows do not come run after run.
+    """
+    runs = runs.flatten()
+    if (runs.diff() < 0).any():
+        raise ValueError(f"The rows must come run after run, got {RUN_KEY!r} = {runs.tolist()}.")
+    return runs.bincount(minlength=num_runs).tolist()
 
 
 # ------------------------------------------------------------------- the tuple policy
@@ -166,7 +173,7 @@ class _StackedHistoryLSTM(DistinctHistoryLSTM):
         readout, run = self.readout, symbols // self.num_symbols
         assert isinstance(readout, nn.Linear)
         order = run.argsort(stable=True)
-        parts = h.index_select(0, order).split(_count(run, self.num_runs))
+        parts = h.index_select(0, order).split(_count(run[order], self.num_runs))
         factors = zip(parts, readout.weight, readout.bias, strict=True)
         return torch.cat([F.linear(*each) for each in factors]).index_select(0, order.argsort())
 

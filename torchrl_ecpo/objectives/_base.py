@@ -51,7 +51,7 @@ class PolicyLoss(LossModule):
         self, values: dict[str, Any], *, allow_zero: bool = False
     ) -> dict[str, float]:
         """Numbers, by name, that are allowed together."""
-        temperatures = {name: _as_float(name, value) for name, value in values.items()}
+        temperatures = {name: as_float(name, value) for name, value in values.items()}
         check_temperatures(allow_zero=allow_zero or self._may_be_zero, **temperatures)
         return temperatures
 
@@ -74,6 +74,8 @@ class PolicyLoss(LossModule):
         """Conjunction of the masks that :attr:`loss_mask_key` names, those that are there."""
         conjunction = None
         for key in self._loss_mask_keys():
+            if self.loss_mask_key != "auto":
+                get_entry(tensordict, key)
             mask = tensordict.get(key, None)
             if mask is None:
                 continue
@@ -98,10 +100,15 @@ def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
         raise ValueError(f"{name} must be one of {choices}, got {value!r}.")
 
 
-def check_count(name: str, value: Any) -> None:
-    """Refuse what is not an integer of at least 1."""
-    if not isinstance(value, int) or value < 1:
-        raise ValueError(f"{name} must be an integer of at least 1, got {value!r}.")
+def check_count(name: str, value: Any, *, least: int = 1, reason: str = "") -> None:
+    """Refuse what is not an integer of at least so many."""
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        raise ValueError(f"{name} must be an integer of at least {least}{reason}, got {value!r}.")
+
+
+def values_can_be_seen() -> bool:
+    """Whether tensors have values to check: not while being compiled, nor within ``torch.vmap``."""
+    return not (torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active())
 
 
 def get_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
@@ -116,7 +123,8 @@ def get_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
     return value
 
 
-def _as_float(name: str, value: Any) -> float:
+def as_float(name: str, value: Any) -> float:
+    """A number from an option."""
     try:
         return float(value)
     except (TypeError, ValueError, RuntimeError):

@@ -9,7 +9,14 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution, Independent, Normal, TransformedDistribution
+from torch.distributions import (
+    Categorical,
+    Distribution,
+    Independent,
+    Normal,
+    OneHotCategorical,
+    TransformedDistribution,
+)
 
 __all__ = ["SampledActions", "gaussian_parameters", "is_discrete", "log_prob_of", "sample_actions"]
 
@@ -28,8 +35,9 @@ class SampledActions(NamedTuple):
 
 
 def is_discrete(distribution: type | Distribution) -> bool:
-    """Whether a policy's distribution is over a finite number of actions."""
-    return getattr(distribution, "has_enumerate_support", False) is True
+    """Whether a policy chooses one of n actions, by index or one-hot."""
+    kind = distribution if isinstance(distribution, type) else type(distribution)
+    return issubclass(kind, (Categorical, OneHotCategorical))
 
 
 def sample_actions(distribution: Distribution, num_samples: int) -> SampledActions:
@@ -46,7 +54,8 @@ def sample_actions(distribution: Distribution, num_samples: int) -> SampledActio
     action, log_volume = latent, 0.0
     for transform in transforms:
         before, action = action, transform(action)
-        log_volume = log_volume + transform.log_abs_det_jacobian(before, action).sum(-1)
+        log_det = transform.log_abs_det_jacobian(before, action)
+        log_volume = log_volume + (log_det if transform.domain.event_dim else log_det.sum(-1))
     return SampledActions(action, base.log_prob(latent) - log_volume, latent, log_volume)
 
 

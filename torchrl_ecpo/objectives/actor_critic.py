@@ -10,13 +10,19 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
+from tensordict.nn import (
+    CompositeDistribution,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    dispatch,
+)
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torch.distributions import Distribution
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator, distance_loss
+from torchrl.objectives.value import TD0Estimator, TD1Estimator, TDLambdaEstimator
 
 from torchrl_ecpo.functional import (
     effective_sample_size,
@@ -27,7 +33,14 @@ from torchrl_ecpo.functional import (
     soft_value_estimate,
     temperature_dual,
 )
-from torchrl_ecpo.objectives._base import PolicyLoss, check_choice, check_count, get_entry
+from torchrl_ecpo.objectives._base import (
+    PolicyLoss,
+    as_float,
+    check_choice,
+    check_count,
+    get_entry,
+    values_can_be_seen,
+)
 from torchrl_ecpo.objectives.actions import (
     SampledActions,
     is_discrete,
@@ -121,6 +134,7 @@ class ActorCriticLoss(PolicyLoss):
 
     _metric_names: ClassVar[tuple[str, ...]]
     _is_discrete: ClassVar[bool]
+    _qvalue_key: ClassVar[str]
     num_action_samples: int
     num_next_action_samples: int
     log_tau: nn.Parameter
@@ -163,10 +177,17 @@ class ActorCriticLoss(PolicyLoss):
                 f"leave delay_value=True and delay_qvalue=None, got {delay_value} and "
                 f"{delay_qvalue}."
             )
-        if num_actor_states is not None and (num_actor_states < 1 or self.reduction == "none"):
+        if num_actor_states is not None:
+            check_count("num_actor_states", num_actor_states)
+            if self.reduction == "none":
+                raise ValueError(
+                    "num_actor_states must be None with reduction='none', where each state has its "
+                    f"number; got {num_actor_states}."
+                )
+        if use_prioritized_weights not in (True, False, "auto"):
             raise ValueError(
-                "num_actor_states must be None or at least 1, and None with reduction='none', "
-                f"where each state has its number; got {num_actor_states}."
+                "use_prioritized_weights must be True, False or 'auto', got "
+                f"{use_prioritized_weights!r}."
             )
         self.num_actor_states = num_actor_states
         self.loss_function = loss_function
@@ -198,12 +219,17 @@ class ActorCriticLoss(PolicyLoss):
         )
         if isinstance(target_entropy, str):
             check_choice("target_entropy", target_entropy, ("auto",))
-        elif target_entropy is not None and not math.isfinite(target_entropy):
+        elif target_entropy is not None and not math.isfinite(
+            target_entropy := as_float("target_entropy", target_entropy)
+        ):
             raise ValueError(
                 f'target_entropy must be finite, in nats, "auto" or None, got {target_entropy}.'
             )
         temperatures = self._as_temperatures({"tau": tau, "tau_prime": tau_prime})
-        if target_kl is not None and not 0 < target_kl < math.inf:
+        if (
+            target_kl is not None
+            and not 0 < (target_kl := as_float("target_kl", target_kl)) < math.inf
+        ):
             raise ValueError(f"target_kl must be above 0, in nats, or None, got {target_kl}.")
         self.target_kl = target_kl
         self.target_entropy = target_entropy
@@ -321,19 +347,21 @@ class ActorCriticLoss(PolicyLoss):
     def _read(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor | None]:
         """The transitions ``[*B]``, and the mask of the real ones where there is one.
 
-        Those that are not real are all 0: the gradient of NaN is NaN, also of a NaN that counts 0.
+        Those that are not real are blank: the gradient of NaN is NaN, also of one that counts 0.
         """
         for key in self.in_keys:
             get_entry(tensordict, key)
-        shape = tensordict.get(self._reward_key).shape[:-1]
+        shape = self._batch_shape(tensordict)
         mask = self._mask(tensordict, shape)
         if mask is None and tensordict.shape == shape:
             return tensordict, None
 
         def only_real(entry: Tensor) -> Tensor:
-            return entry if mask is None else entry.masked_fill(_expand(~mask, entry), 0)
+            return entry if mask is None else _blank(entry, ~mask)
 
         transitions: Any = tensordict.apply(only_real, batch_size=shape)
+        if mask is not None:
+            transitions.update(tensordict.select(*self._loss_mask_keys(), strict=False))
         return transitions, mask
 
     def soft_bellman_target(self, tensordict: TensorDictBase) -> Tensor:
@@ -348,13 +376,19 @@ class ActorCriticLoss(PolicyLoss):
             value = value.unsqueeze(-1).masked_fill(ended, 0.0)
             valued = tensordict.copy()
             valued.set(unravel_key(("next", self.tensor_keys.value)), value)
+            mask = self._mask(tensordict, ended.shape[:-1])
+            if mask is not None and mask.ndim:
+                # What is not real follows on nothing: TD(1) and TD(lambda) look no further.
+                is_followed = (mask & mask.roll(-1, -1)).unsqueeze(-1)
+                done = unravel_key(("next", self.tensor_keys.done))
+                valued.set(done, tensordict.get(done) | ~is_followed)
             return self.value_estimator.value_estimate(valued).squeeze(-1)
 
     def _next_state_value(self, tensordict: TensorDictBase, ended: Tensor) -> Tensor:
         """V(s') ``[*B]`` of the delayed value network, or of the lift by delayed soft Q (Eq. 8)."""
         observations = tensordict.select(*self._next_observations)
         if self.skip_done_states:
-            observations = observations.apply(lambda x: x.masked_fill(_expand(ended, x), 0))
+            observations = observations.apply(lambda x: _blank(x, ended))
         if self.value_network is not None:
             return self._state_value(observations, self.target_value_network_params)
         params = self.target_actor_network_params if self.delay_actor else self.actor_network_params
@@ -378,13 +412,22 @@ class ActorCriticLoss(PolicyLoss):
             score, log_prob, actions = self._scored_actions(
                 observations, reference, qvalue_params, num_samples
             )
+            if log_prob.shape != score.shape:
+                raise ValueError(
+                    f"The soft Q values of the actions have the shape {tuple(score.shape)}, their "
+                    f"log-probabilities {tuple(log_prob.shape)}: actor and Q network must know the "
+                    "same actions, and an action of several numbers has one log-probability, as "
+                    "with torch.distributions.Independent or TanhNormal."
+                )
             tau, tau_prime = self.temperatures()
             log_weights = lifted_log_weights(score, log_prob, tau=tau, tau_prime=tau_prime)
+            mask = None
             if actions is None:  # nobody has drawn them: the reference counts by its probability
-                log_weights = log_weights + log_prob
+                mask = ~(log_prob <= impossible(log_prob))  # NaN is not impossible, but wrong
+                log_weights = (log_weights + log_prob).where(mask, impossible(log_prob))
             weights = self_normalised_weights(log_weights, sample_dim=0)
             value_of = soft_value if actions is None else soft_value_estimate
-            value = value_of(score, log_prob, tau=tau, tau_prime=tau_prime, sample_dim=0)
+            value = value_of(score, log_prob, tau=tau, tau_prime=tau_prime, sample_dim=0, mask=mask)
         return Lift(score, log_prob, log_weights, weights, value, actions)
 
     def _qvalue_loss(self, tensordict: TensorDictBase, target: Tensor) -> tuple[Tensor, Tensor]:
@@ -406,7 +449,8 @@ class ActorCriticLoss(PolicyLoss):
         assert params is not None
         observations = observations.select(*network.in_keys)
         with params.to_module(network, preserve_module_state=False):
-            return network(observations).get(self.tensor_keys.value).squeeze(-1)
+            outputs = network(observations)
+        return _written(outputs, "value", self.tensor_keys.value, network).squeeze(-1)
 
     def _policies(self, tensordict: TensorDictBase) -> tuple[Distribution, Distribution]:
         """The policy being trained, and the reference: its delayed copy, or itself."""
@@ -423,7 +467,8 @@ class ActorCriticLoss(PolicyLoss):
             params.to_module(self.actor_network, preserve_module_state=False),
         ):
             distribution = self.actor_network.get_dist(inputs)
-        if is_discrete(distribution) != self._is_discrete:
+        self._check_policy(type(distribution))
+        if not self._is_discrete and not distribution.has_rsample:
             self._refuse(type(distribution))
         return distribution
 
@@ -572,12 +617,14 @@ class ActorCriticLoss(PolicyLoss):
         }
 
     def make_value_estimator(
-        self, value_type: ValueEstimators | None = None, **hyperparams: Any
+        self, value_type: ValueEstimators | str | Any = None, **hyperparams: Any
     ) -> ActorCriticLoss:
         """Choose how rewards and soft values make the target of Q, see TorchRL's ``SACLoss``.
 
         Args:
-            value_type: TD(0) by default, the paper's; TD(1) and TD(lambda) on trajectories.
+            value_type: TD(0) by default, the paper's; TD(1) and TD(lambda) on trajectories. A
+                member of ``ValueEstimators``, its name (``"td0"``), or an estimator of TorchRL's
+                or its class, with ``value_network=None``.
             hyperparams: of the estimator, such as ``gamma`` (0.99 by default).
 
         Returns:
@@ -585,20 +632,43 @@ class ActorCriticLoss(PolicyLoss):
 
         Raises:
             NotImplementedError: for an estimator that needs more than values.
+            ValueError: for an estimator with a value network.
         """
-        value_type, options = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
-        if value_type is not None and options is not None:
+        resolved, options = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
+        if resolved is not None and options is not None:
             dispatch_value_estimator(
                 self,
-                value_type,
+                resolved,
                 supported=self.SUPPORTED_VALUE_ESTIMATORS,
                 tensor_keys=self._value_estimator_keys,
                 value_network=None,
                 **options,
             )
+            return self
+        own = self._value_estimator
+        if not isinstance(own, (TD0Estimator, TD1Estimator, TDLambdaEstimator)):
+            raise NotImplementedError(
+                f"{type(own).__name__} is not implemented for {type(self).__name__}, which takes "
+                "TD0Estimator, TD1Estimator and TDLambdaEstimator."
+            )
+        if own.value_network is not None:
+            raise ValueError(
+                f"The {type(own).__name__} must have value_network=None: the loss itself computes "
+                "the soft value of the next state."
+            )
+        own.set_keys(**self._value_estimator_keys)
         return self
 
     # ------------------------------------------------------------------------------------ critics
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the vmapped function, which cannot be pickled and holds these networks."""
+        return {name: value for name, value in self.__dict__.items() if name != "_vmap_qvalue"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Make the function anew, of the networks of the copy."""
+        super().__setstate__(state)
+        self._make_vmap()
 
     def _make_vmap(self) -> None:
         self._vmap_qvalue: Any = _vmap_func(
@@ -611,13 +681,16 @@ class ActorCriticLoss(PolicyLoss):
         self, inputs: TensorDictBase, params: TensorDictParams, key: NestedKey
     ) -> Tensor:
         """What each of the N Q networks writes, ``[N, ...]``."""
+        network, name = self.qvalue_network, self._qvalue_key
+        if hasattr(network, "each"):  # it knows a faster way, see DenseNetwork
+            return _written(network.each(inputs, params), name, key, network)
         if not self.deactivate_vmap:
-            return self._vmap_qvalue(inputs, params).get(key)
+            return _written(self._vmap_qvalue(inputs, params), name, key, network)
         # TorchRL's pseudo-vmap does this too, and stacks all else that is in the inputs.
         outputs = []
         for each in params.unbind(0):
-            with each.to_module(self.qvalue_network, preserve_module_state=False):
-                outputs.append(self.qvalue_network(inputs.copy()).get(key))
+            with each.to_module(network, preserve_module_state=False):
+                outputs.append(_written(network(inputs.copy()), name, key, network))
         return torch.stack(outputs)
 
     @property
@@ -647,21 +720,42 @@ class ActorCriticLoss(PolicyLoss):
         for module in reversed(list(actor_network.modules())):
             distribution_class = getattr(module, "distribution_class", None)
             if isinstance(distribution_class, type):
-                if is_discrete(distribution_class) != self._is_discrete:
-                    self._refuse(distribution_class)
+                self._check_policy(distribution_class)
                 break
 
+    def _batch_shape(self, tensordict: TensorDictBase) -> torch.Size:
+        """[*B] of a batch, from its rewards."""
+        shape = tensordict.get(self._reward_key).shape
+        if shape[-1:] != (1,):
+            raise ValueError(
+                f"The reward {self._reward_key!r} must have the shape [*B, 1], got {tuple(shape)}."
+            )
+        for name in ("done", "terminated"):
+            key = unravel_key(("next", getattr(self.tensor_keys, name)))
+            if tensordict.get(key).shape != shape:
+                raise ValueError(
+                    f"The entry {key!r} must have the shape {tuple(shape)} of the reward, got "
+                    f"{tuple(tensordict.get(key).shape)}."
+                )
+        return shape[:-1]
+
+    def _check_policy(self, distribution_class: type) -> None:
+        is_composite = issubclass(distribution_class, CompositeDistribution)
+        if is_composite or is_discrete(distribution_class) != self._is_discrete:
+            self._refuse(distribution_class)
+
     def _refuse(self, distribution_class: type) -> None:
-        kinds = ("discrete", "continuous") if self._is_discrete else ("continuous", "discrete")
+        one_of_n, many = "one of n actions (Categorical, OneHotCategorical)", "actions with rsample"
+        own, other = (one_of_n, many) if self._is_discrete else (many, one_of_n)
         raise ValueError(
-            f"{type(self).__name__} is for {kinds[0]} actions, but the actor's distribution "
-            f"{distribution_class.__name__} is over {kinds[1]} ones: use {self._twin}."
+            f"{type(self).__name__} is for policies over {own}, got {distribution_class.__name__}. "
+            f"For those over {other}, use {self._twin}."
         )
 
     @staticmethod
     def _check_values(quantities: dict[str, Tensor]) -> None:
         """Refuse values that would silently spoil the networks. One look; none when compiled."""
-        if torch.compiler.is_compiling():
+        if not values_can_be_seen():
             return
         if math.isfinite(sum(values.detach().sum() for values in quantities.values())):
             return
@@ -679,6 +773,7 @@ class ContinuousActorCriticLoss(ActorCriticLoss):
     """An :class:`ActorCriticLoss` that knows the lift by M actions of the reference policy."""
 
     _is_discrete = False
+    _qvalue_key = "state_action_value"
     _metric_names = (
         "ESS",
         "kl_target",
@@ -728,15 +823,17 @@ class ContinuousActorCriticLoss(ActorCriticLoss):
     ) -> Tensor:
         """The least of the soft Q values ``[M, *B]`` of actions ``[M, *B, A]``."""
         shape = action.shape[:-1]
-        inputs = observations.select(*self._qvalue_observations).expand(shape).reshape(-1)
-        inputs.set(self.tensor_keys.action, action.reshape(-1, action.shape[-1]))
+        # Samples become more rows, not more steps, which a recurrent network would tell apart.
+        rows = (-1, *shape[2:])
+        inputs = observations.select(*self._qvalue_observations).expand(shape).reshape(rows)
+        inputs.set(self.tensor_keys.action, action.reshape(*rows, action.shape[-1]))
         qvalues = self._each_qvalue(inputs, qvalue_params, self.tensor_keys.state_action_value)
-        return qvalues.amin(0).reshape(shape)
+        return _squeezed(qvalues.amin(0)).reshape(shape)
 
     def _chosen_qvalue(self, tensordict: TensorDictBase) -> Tensor:
         inputs = tensordict.select(*self.qvalue_network.in_keys)
         key = self.tensor_keys.state_action_value
-        return self._each_qvalue(inputs, self.qvalue_network_params, key).squeeze(-1)
+        return _squeezed(self._each_qvalue(inputs, self.qvalue_network_params, key))
 
     def _metrics(
         self, lift: Lift, policy: Distribution, reference: Distribution
@@ -773,6 +870,7 @@ class DiscreteActorCriticLoss(ActorCriticLoss):
     """An :class:`ActorCriticLoss` that knows the lift exactly: Eq. 8, summed over all actions."""
 
     _is_discrete = True
+    _qvalue_key = "action_value"
     _metric_names = ("ESS", "kl_target", "kl_to_reference", "entropy", "qvalue", "state_value")
     num_action_samples = num_next_action_samples = 0  # nothing is sampled
 
@@ -822,8 +920,17 @@ class DiscreteActorCriticLoss(ActorCriticLoss):
 
 
 def log_probs_of_all(policy: Any) -> Tensor:
-    """Log-probability of every action of a categorical or one-hot policy, actions first."""
-    return policy.logits.log_softmax(-1).movedim(-1, 0)
+    """Log-probability of every action of a categorical or one-hot policy, actions first.
+
+    That of an action without probability is :func:`impossible`: minus infinity times 0 is NaN.
+    """
+    log_probs = policy.logits.log_softmax(-1).movedim(-1, 0)
+    return log_probs.masked_fill(log_probs == -torch.inf, impossible(log_probs))
+
+
+def impossible(like: Tensor) -> float:
+    """A log-probability so low that nothing comes of it, and finite."""
+    return torch.finfo(like.dtype).min / 4
 
 
 def _saturation(action: Tensor, policy: Distribution) -> Tensor:
@@ -835,5 +942,27 @@ def _saturation(action: Tensor, policy: Distribution) -> Tensor:
     return (position.abs() > SATURATED).to(action.dtype).mean((0, -1))
 
 
-def _expand(mask: Tensor, like: Tensor) -> Tensor:
-    return mask.reshape(*mask.shape, *(1,) * (like.ndim - mask.ndim))
+def _blank(entry: Tensor, where: Tensor) -> Tensor:
+    """0 in these places, and True in a mask, as that of the actions that may be taken."""
+    where = where.reshape(*where.shape, *(1,) * (entry.ndim - where.ndim))
+    return entry.masked_fill(where, entry.dtype == torch.bool)
+
+
+def _written(outputs: TensorDictBase, name: str, key: NestedKey, network: Any) -> Tensor:
+    """What a network has written."""
+    value = outputs.get(key, None)
+    if value is None:
+        raise KeyError(
+            f"The network writes {list(network.out_keys)}, not {key!r}, its {name}: build it with "
+            f"that out_key, or name another with set_keys({name}=...)."
+        )
+    return value
+
+
+def _squeezed(qvalues: Tensor) -> Tensor:
+    """Without the trailing dimension of 1."""
+    if qvalues.shape[-1] != 1:
+        raise ValueError(
+            f"A soft Q value is one number, [*B, 1], but the Q network writes {qvalues.shape[-1]}."
+        )
+    return qvalues.squeeze(-1)

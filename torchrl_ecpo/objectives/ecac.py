@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from torchrl_ecpo.functional import centred_gaussian_projection, mean_seeking_projection
-from torchrl_ecpo.objectives._base import check_choice
+from torchrl_ecpo.objectives._base import check_choice, check_count
 from torchrl_ecpo.objectives.actions import gaussian_parameters, log_prob_of
 from torchrl_ecpo.objectives.actor_critic import (
     ContinuousActorCriticLoss,
@@ -67,7 +67,7 @@ class ECACLoss(ContinuousActorCriticLoss):
         num_qvalue_nets: the least of so many soft Q values counts. Default: 2 (the paper's).
         num_actor_states: the policy, the value network and the temperatures learn from the first so
             many entries of the batch only, which saves time where M is large. Default: None, all.
-        num_action_samples: M. Default: 8.
+        num_action_samples: M, at least 2. Default: 8.
         num_next_action_samples: actions at the next state, from which its value is computed where
             there is no value network. Default: 1 (the paper's estimate).
         loss_function: ``"l2"`` (default; Eq. 9 and 10 without their factor 1/2), ``"l1"`` or
@@ -85,8 +85,10 @@ class ECACLoss(ContinuousActorCriticLoss):
             nothing, also those of a time limit. Default: False; nothing is expected after
             ``terminated`` states in either case, whatever stands there.
         use_prioritized_weights: whether losses are weighted by the entry ``"priority_weight"``;
-            ``"auto"`` (default): if it is there.
+            True and ``"auto"`` (default): if it is there.
         deactivate_vmap: if True, the Q networks are called one after another. Default: False.
+            A network with a method ``each``, as :class:`~torchrl_ecpo.modules.DenseNetwork`, is
+            called by it in either case.
 
     The outputs are ``loss_actor``, ``loss_qvalue``, ``loss_value`` (with a value network),
     ``loss_tau`` and ``loss_tau_prime`` (where learned), each reaching its own parameters only, so
@@ -162,6 +164,8 @@ class ECACLoss(ContinuousActorCriticLoss):
         deactivate_vmap: bool = False,
     ) -> None:
         check_choice("projection", projection, PROJECTIONS)
+        reason = ": weights are relative to those of the other actions"
+        check_count("num_action_samples", num_action_samples, least=2, reason=reason)
         super().__init__(
             actor_network,
             qvalue_network,
@@ -214,7 +218,8 @@ class DiscreteECACLoss(DiscreteActorCriticLoss):
 
     Args:
         actor_network: a policy with ``get_dist`` over ``n`` actions: ``Categorical`` or
-            ``OneHotCategorical``.
+            ``OneHotCategorical``, TorchRL's masked ones among them: actions that a mask forbids
+            have no part in the lift.
         qvalue_network: reads the observation, writes ``"action_value"`` ``[*B, n]``.
         value_network: as for :class:`ECACLoss`.
 

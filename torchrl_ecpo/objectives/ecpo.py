@@ -30,11 +30,12 @@ class ECPOLoss(LiftProjectLoss):
 
     Keyword Args:
         tau: temperature of the divergence from the reference policy, in the unit of the return.
-            Defaults to 0.5, the middle of the values searched on the algorithmic tasks (rewards of 1
-            a symbol), where 0.25 or 1 was best.
+            Defaults to 0.5, the middle of the values searched on the algorithmic tasks (rewards of
+            1 a symbol), where 0.25 or 1 was best.
         tau_prime: temperature of the entropy, in the unit of the return. What matters is
-            tau_prime / (tau + tau_prime). Defaults to 0.01, where the runs on the same tasks start;
-            anneal it towards 0 where the task asks for a deterministic policy. 0 is the paper's ablation.
+            tau_prime / (tau + tau_prime). Defaults to 0.01, where the runs on the same tasks
+            start; anneal it towards 0 where the task asks for a deterministic policy. 0 is the
+            paper's ablation.
         length_normalised: if True, the entropy term is per step. Defaults to False (the paper).
         control_variate: if True, the self-normalised ratios pi_theta/pi_bar are subtracted from
             the weights, which removes the drift of groups without a preference. Defaults to False

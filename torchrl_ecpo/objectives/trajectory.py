@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams, is_tensor_collection
 from tensordict.nn import (
     CompositeDistribution,
+    ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
+    TensorDictSequential,
     composite_lp_aggregate,
     dispatch,
 )
@@ -24,7 +26,7 @@ from torchrl_ecpo.functional import (
     lifted_log_weights,
     self_normalised_weights,
 )
-from torchrl_ecpo.objectives._base import PolicyLoss, get_entry
+from torchrl_ecpo.objectives._base import PolicyLoss, get_entry, values_can_be_seen
 
 __all__ = ["LiftProjectLoss", "TrajectoryGroupLoss", "TrajectoryGroups"]
 
@@ -74,7 +76,8 @@ class TrajectoryGroupLoss(PolicyLoss):
     Args:
         actor_network: a policy with ``get_dist``: feed-forward or recurrent (it is called in
             recurrent mode on ``[N, T]``), with any action distribution whose log-probability has
-            the shape of the batch, also a composite one (the parts are added up).
+            the shape of the batch, also a composite one (the parts are added up), or several
+            distributions, each of which may read what those before it have drawn.
 
     Keyword Args:
         temperatures: initial values by name; each becomes a buffer that is scheduled by assignment
@@ -88,9 +91,10 @@ class TrajectoryGroupLoss(PolicyLoss):
 
     Raises:
         ValueError: for an unknown reduction or a temperature that is not allowed; when called, for
-            a wrong shape, a group of one, a mask without a real step, a reward or
-            log-probability that is not finite. (Under ``torch.compile`` values are not looked at,
-            only shapes: NaN then gives NaN, and a mask without a real step gives 0.)
+            a wrong shape, a group of one, also one that the mask leaves, a mask with a hole, a
+            reward or log-probability that is not finite. (Under ``torch.compile`` and
+            ``torch.vmap`` values are not looked at, only shapes: NaN then gives NaN, and a mask
+            without a real step gives 0.)
         TypeError: if ``actor_network`` has no ``get_dist``.
         KeyError: when called, for a missing entry.
     """
@@ -216,6 +220,8 @@ class TrajectoryGroupLoss(PolicyLoss):
         reward = get_entry(tensordict, self._reward_key)
         shape = _batch_shape(reward, self._reward_key)
         step_mask = self._mask(tensordict, shape)
+        if step_mask is not None and values_can_be_seen():
+            _check_padding(step_mask, self._loss_mask_keys())
 
         def over_steps(values: Tensor) -> Tensor:
             return (values if step_mask is None else values.where(step_mask, 0.0)).sum(-1)
@@ -274,9 +280,43 @@ class TrajectoryGroupLoss(PolicyLoss):
     ) -> Tensor:
         """Log-probability ``[*G, K, T]`` of the recorded actions under given parameters."""
         inputs = inputs.copy()  # the actor writes its intermediate results into its input
-        with params.to_module(self.actor_network, preserve_module_state=False):
-            dist = self.actor_network.get_dist(inputs)
         action_keys = _as_list(self.tensor_keys.action)
+        steps = list(_steps_of(self.actor_network))
+        with params.to_module(self.actor_network, preserve_module_state=False):
+            if sum(isinstance(step, ProbabilisticTensorDictModule) for step in steps) > 1:
+                return self._log_prob_of_parts(steps, inputs, action_keys).reshape(shape)
+            dist = self.actor_network.get_dist(inputs)
+        return self._log_prob_of_action(dist, inputs, action_keys).reshape(shape)
+
+    def _log_prob_of_parts(
+        self, steps: list[Any], inputs: TensorDictBase, action_keys: list[NestedKey]
+    ) -> Tensor:
+        """Of an action drawn part by part, each given those before it.
+
+        The actor's own ``get_dist`` would draw the parts anew, to hand them to the next.
+        """
+        log_prob, drawn = torch.zeros(()), []
+        for step in steps:
+            if not isinstance(step, ProbabilisticTensorDictModule):
+                inputs = step(inputs)
+                continue
+            keys = list(step.dist_sample_keys)
+            drawn += keys
+            if not set(keys) <= set(action_keys):
+                break
+            log_prob = log_prob + self._log_prob_of_action(step.get_dist(inputs), inputs, keys)
+        if set(drawn) != set(action_keys):
+            raise ValueError(
+                f"The actor draws the parts {drawn} of an action, one after the other, but the "
+                f"action is {action_keys}. Name all of them with set_keys(action=[...])."
+            )
+        return log_prob
+
+    @staticmethod
+    def _log_prob_of_action(
+        dist: Any, inputs: TensorDictBase, action_keys: list[NestedKey]
+    ) -> Tensor:
+        """Log-probability ``[N, T]`` of recorded actions, under one distribution."""
         if isinstance(dist, CompositeDistribution):
             log_prob = dist.log_prob(inputs.select(*action_keys))
         elif len(action_keys) == 1:
@@ -295,7 +335,7 @@ class TrajectoryGroupLoss(PolicyLoss):
                 "have one number for each step: sum over the parts of an action, for example with "
                 "torch.distributions.Independent or IndependentNormal."
             )
-        return log_prob.reshape(shape)
+        return log_prob
 
     def _recorded_log_prob(self, tensordict: TensorDictBase, shape: torch.Size) -> Tensor | None:
         """Log-probability ``[*G, K, T]`` under the policy that drew the actions, if it is there."""
@@ -329,7 +369,7 @@ class TrajectoryGroupLoss(PolicyLoss):
 
     def _check_values(self, groups: TrajectoryGroups) -> None:
         """Refuse values that would silently spoil a whole group. One look; none when compiled."""
-        if torch.compiler.is_compiling():
+        if not values_can_be_seen():
             return
         quantities = {
             f"entry {self._reward_key!r}": groups.returns,
@@ -340,13 +380,14 @@ class TrajectoryGroupLoss(PolicyLoss):
         if groups.behaviour_log_prob is groups.reference_log_prob and self.delay_actor:
             del quantities[f"entry {self.tensor_keys.sample_log_prob!r}"]  # it is not there
         finite = torch.stack(list(quantities.values())).isfinite()
-        has_steps = finite.new_ones(()) if groups.mask is None else groups.mask.any(-1)
-        if bool((finite.all() & has_steps.all()).item()):
+        is_group = finite.new_ones(()) if groups.mask is None else groups.mask.sum(-1) >= 2
+        if bool((finite.all() & is_group.all()).item()):
             return
-        if not bool(has_steps.all().item()):
+        if not bool(is_group.all().item()):
             raise ValueError(
-                f"The mask ({self._loss_mask_keys()}) leaves {int((~has_steps).sum())} group(s) "
-                "without a single real step. Drop such groups before calling the loss."
+                f"The mask ({self._loss_mask_keys()}) leaves {int((~is_group).sum())} group(s) "
+                "with fewer than two trajectories that have a real step: weights are relative to "
+                "the other trajectories of the group. Drop such groups before calling the loss."
             )
         name, values = next(item for item in quantities.items() if not item[1].isfinite().all())
         raise ValueError(
@@ -405,6 +446,15 @@ class LiftProjectLoss(TrajectoryGroupLoss):
 # ------------------------------------------------------------------------------------- small parts
 
 
+def _steps_of(module: Any) -> Iterator[Any]:
+    """The modules that a policy calls one after the other."""
+    if isinstance(module, TensorDictSequential):
+        for each in module.module:
+            yield from _steps_of(each)
+    else:
+        yield module
+
+
 def _as_list(keys: NestedKey | list[NestedKey] | None) -> list[NestedKey]:
     return list(keys) if isinstance(keys, list) else [keys]  # type: ignore[list-item]
 
@@ -434,15 +484,23 @@ def _batch_shape(reward: Tensor, key: NestedKey) -> torch.Size:
     return reward.shape[:-1]
 
 
+def _check_padding(step_mask: Tensor, keys: Sequence[NestedKey]) -> None:
+    """Refuse holes: a policy with memory would read other histories than those it acted on."""
+    holes = (step_mask[..., 1:] & ~step_mask[..., :-1]).any(-1)
+    if holes.any():
+        raise ValueError(
+            f"The mask {tuple(keys)} has holes in {int(holes.sum())} trajectories: their real "
+            "steps must come first, and the padding after them."
+        )
+
+
 def _last_real_step(step_mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Index ``[N, T]`` of the last real step at or before each step, the first real one if none.
+    """Index ``[N, T]`` of the last real step at or before each step.
 
     Trajectories without a real step borrow those of the first trajectory that has one.
     """
     steps = torch.arange(step_mask.shape[-1], device=step_mask.device)
-    latest = steps.where(step_mask, -1).cummax(-1).values
-    first = step_mask.int().argmax(-1, keepdim=True)
-    columns = latest.where(latest >= 0, first)
+    columns = steps.minimum(step_mask.sum(-1, keepdim=True) - 1)
     has_steps = step_mask.any(-1)
     rows = torch.arange(step_mask.shape[0], device=step_mask.device)
     rows = rows.where(has_steps, has_steps.int().argmax())
