@@ -275,8 +275,10 @@ def aggregates(study: Study, cells: Sequence[CellResult]) -> str:
     ]
     unit = f"the mean of {study.scale_by}" if study.scale_by else "the score of a perfect policy"
     titles = ", ".join(r.title for r in tasks.values())
-    return f"Final scores over {titles}, each in units of {unit}:\n\n" + table(
-        ("method", "runs a task", "IQM", f"probability that {first} is better"), rows
+    header = ("method", "runs a task", "IQM", f"probability that {first} is better")
+    return (
+        f"Final scores over {titles}, each in units of {unit}; of a method that has more runs on "
+        "one task than on another, the first seeds:\n\n" + table(header, rows)
     )
 
 
