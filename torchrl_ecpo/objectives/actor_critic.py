@@ -23,6 +23,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator, distance_loss
 from torchrl.objectives.value import TD0Estimator, TD1Estimator, TDLambdaEstimator
+from torchrl.objectives.value.advantages import ValueEstimatorBase
 
 from torchrl_ecpo.functional import (
     effective_sample_size,
@@ -219,18 +220,17 @@ class ActorCriticLoss(PolicyLoss):
         )
         if isinstance(target_entropy, str):
             check_choice("target_entropy", target_entropy, ("auto",))
-        elif target_entropy is not None and not math.isfinite(
-            target_entropy := as_float("target_entropy", target_entropy)
-        ):
-            raise ValueError(
-                f'target_entropy must be finite, in nats, "auto" or None, got {target_entropy}.'
-            )
+        elif target_entropy is not None:
+            target_entropy = as_float("target_entropy", target_entropy)
+            if not math.isfinite(target_entropy):
+                raise ValueError(
+                    f'target_entropy must be finite, in nats, "auto" or None, got {target_entropy}.'
+                )
         temperatures = self._as_temperatures({"tau": tau, "tau_prime": tau_prime})
-        if (
-            target_kl is not None
-            and not 0 < (target_kl := as_float("target_kl", target_kl)) < math.inf
-        ):
-            raise ValueError(f"target_kl must be above 0, in nats, or None, got {target_kl}.")
+        if target_kl is not None:
+            target_kl = as_float("target_kl", target_kl)
+            if not 0 < target_kl < math.inf:
+                raise ValueError(f"target_kl must be above 0, in nats, or None, got {target_kl}.")
         self.target_kl = target_kl
         self.target_entropy = target_entropy
         self._set_temperature("tau", temperatures["tau"], min_tau, is_learned=target_kl is not None)
@@ -617,7 +617,13 @@ class ActorCriticLoss(PolicyLoss):
         }
 
     def make_value_estimator(
-        self, value_type: ValueEstimators | str | Any = None, **hyperparams: Any
+        self,
+        value_type: ValueEstimators
+        | str
+        | ValueEstimatorBase
+        | type[ValueEstimatorBase]
+        | None = None,
+        **hyperparams: Any,
     ) -> ActorCriticLoss:
         """Choose how rewards and soft values make the target of Q, see TorchRL's ``SACLoss``.
 
