@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from torchrl_ecpo.experiment import read_metrics
+from torchrl_ecpo.modules import DenseNetwork
 
 SCRIPT = Path(__file__).parents[1] / "sota-implementations/ecac"
 TINY = (
@@ -257,17 +258,19 @@ def test_the_way_q_networks_are_called_changes_no_number(utils, monkeypatch, los
         [256],
     )
 
-    def losses_and_gradients():
+    def losses_and_gradients(*, by_vmap):
         torch.manual_seed(0)
         loss_module = utils.make_loss(config, utils.make_actor(config, env), env)
         utils.make_updater(config, loss_module)
+        if by_vmap:
+            monkeypatch.delattr(DenseNetwork, "each")
+            loss_module._make_vmap()
         losses = loss_module(batch.copy())
         sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
         return losses.detach().to_dict(), [each.grad for each in loss_module.parameters()]
 
-    ours = losses_and_gradients()
-    monkeypatch.setattr(utils, "_call_each_qvalue", lambda loss_module: None)
-    torch.testing.assert_close(ours, losses_and_gradients())
+    ours = losses_and_gradients(by_vmap=False)
+    torch.testing.assert_close(ours, losses_and_gradients(by_vmap=True))
 
 
 def test_adam_has_a_group_for_each_learning_rate(utils):
