@@ -109,15 +109,20 @@ def _stack_parameters(stacked: nn.Module, modules: Sequence[nn.Module]) -> None:
 
 
 def _count(runs: Tensor, num_runs: int) -> list[int]:
-    """How many rows each run has.
+    """How many rows each run has."""
+    return runs.flatten().bincount(minlength=num_runs).tolist()
+
+
+def _count_rows(tensordict: TensorDictBase, num_runs: int) -> list[int]:
+    """How many rows of a batch each run has.
 
     Raises:
         ValueError: if the rows do not come run after run.
     """
-    runs = runs.flatten()
+    runs = tensordict.get(RUN_KEY).flatten()
     if (runs.diff() < 0).any():
         raise ValueError(f"The rows must come run after run, got {RUN_KEY!r} = {runs.tolist()}.")
-    return runs.bincount(minlength=num_runs).tolist()
+    return _count(runs, num_runs)
 
 
 # ------------------------------------------------------------------- the tuple policy
@@ -173,7 +178,7 @@ class _StackedHistoryLSTM(DistinctHistoryLSTM):
         readout, run = self.readout, symbols // self.num_symbols
         assert isinstance(readout, nn.Linear)
         order = run.argsort(stable=True)
-        parts = h.index_select(0, order).split(_count(run[order], self.num_runs))
+        parts = h.index_select(0, order).split(_count(run, self.num_runs))
         factors = zip(parts, readout.weight, readout.bias, strict=True)
         return torch.cat([F.linear(*each) for each in factors]).index_select(0, order.argsort())
 
@@ -199,7 +204,7 @@ class _StackedTupleActor(ProbabilisticActor):
         tensordict = self.core(tensordict)
         logits = tensordict.get("logits")
         distribution = TupleCategorical(logits, **self.options)
-        sizes = _count(tensordict.get(RUN_KEY), self.core.num_runs)
+        sizes = _count_rows(tensordict, self.core.num_runs)
         uniform = self.streams.uniform(sizes, logits.shape[-1]).view_as(logits)
         action = distribution.choose(uniform)
         tensordict.set("action", action)
@@ -253,9 +258,9 @@ class _StackedSoftmaxPolicy(TensorDictModuleBase):
 
     def get_dist(self, tensordict: TensorDictBase) -> _StackedCategorical:
         """The distributions of all runs."""
-        run = tensordict.get(RUN_KEY)
         logits = [each @ theta for each, theta in zip(self.features, self.theta, strict=True)]
-        return _StackedCategorical(logits, _count(run, len(logits)), run.shape)
+        sizes = _count_rows(tensordict, len(logits))
+        return _StackedCategorical(logits, sizes, tensordict.get(RUN_KEY).shape)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write action and log-probability."""
