@@ -238,13 +238,11 @@ def test_time_limits_are_truncations(utils, name, ends_early):
     assert last["observation"].dtype == torch.float32
 
 
-@pytest.mark.parametrize("loss", ["ecac", "pmd_ac", "sac", "sac_score"])
-def test_the_way_q_networks_are_called_changes_no_number(utils, monkeypatch, loss):
-    config = configure(["hidden_sizes=[16,16]", f"loss={loss}"])
-    env = utils.make_environment(config, seed=0)
+def random_transitions():
+    """256 of Pendulum's, none of which ends an episode."""
     never = torch.zeros(256, 1, dtype=torch.bool)
     torch.manual_seed(0)
-    batch = TensorDict(
+    return TensorDict(
         {
             "observation": torch.randn(256, 3),
             "action": torch.rand(256, 1),
@@ -257,6 +255,13 @@ def test_the_way_q_networks_are_called_changes_no_number(utils, monkeypatch, los
         },
         [256],
     )
+
+
+@pytest.mark.parametrize("loss", ["ecac", "pmd_ac", "sac", "sac_score", "td3"])
+def test_the_way_q_networks_are_called_changes_no_number(utils, monkeypatch, loss):
+    config = configure(["hidden_sizes=[16,16]", f"loss={loss}"])
+    env = utils.make_environment(config, seed=0)
+    batch = random_transitions()
 
     def losses_and_gradients(*, by_vmap):
         torch.manual_seed(0)
@@ -271,6 +276,27 @@ def test_the_way_q_networks_are_called_changes_no_number(utils, monkeypatch, los
 
     ours = losses_and_gradients(by_vmap=False)
     torch.testing.assert_close(ours, losses_and_gradients(by_vmap=True))
+
+
+@pytest.mark.parametrize("loss", ["td3", "sac"])
+def test_an_update_that_leaves_the_policy_is_the_same_for_q(utils, loss):
+    config = configure(["hidden_sizes=[16,16]", f"loss={loss}"])
+    env = utils.make_environment(config, seed=0)
+    batch = random_transitions()
+    loss_module = utils.make_loss(config, utils.make_actor(config, env), env)
+    utils.make_updater(config, loss_module)
+
+    def loss_of_q_and_gradients(*, with_policy):
+        torch.manual_seed(0)
+        losses = utils.compute_losses(loss_module, batch.copy(), with_policy)
+        assert ("loss_actor" in losses) is (with_policy or loss == "sac")
+        losses["loss_qvalue"].backward()
+        gradients = [parameter.grad for parameter in loss_module.qvalue_network_params.parameters()]
+        loss_module.zero_grad()
+        return losses["loss_qvalue"].detach(), gradients
+
+    whole = loss_of_q_and_gradients(with_policy=True)
+    torch.testing.assert_close(loss_of_q_and_gradients(with_policy=False), whole, rtol=0, atol=0)
 
 
 def test_adam_has_a_group_for_each_learning_rate(utils):

@@ -17,6 +17,7 @@ from utils import (
     Every,
     Speed,
     check_config,
+    compute_losses,
     evaluate,
     finished_returns,
     make_actor,
@@ -105,7 +106,9 @@ def main(config: DictConfig) -> None:
             if progress.frames > config.collector.init_random_frames:
                 for _ in range(len(transitions) * config.updates_per_frame):
                     is_policy_due = (progress.updates + 1) % config.loss.policy_delay == 0
-                    losses = loss_module(replay_buffer.sample())
+                    batch = replay_buffer.sample()
+                    # What is compiled is the whole.
+                    losses = compute_losses(loss_module, batch, is_policy_due or config.compile)
                     loss = total(losses, is_policy_due)
                     if not loss.isfinite():
                         run.check(scalars(losses), progress.frames)

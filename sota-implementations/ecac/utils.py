@@ -157,11 +157,29 @@ def make_loss(config: DictConfig, actor: TensorDictModuleBase, env: EnvBase) -> 
         options["noise_clip"] *= _half_range(action_spec)
     loss_module = LOSSES[config.loss.name](actor, *critics, **options)
     loss_module.make_value_estimator(gamma=config.gamma)
+    # In the place of vmap, as in our own losses; the numbers are the same. (TorchRL's own
+    # replacement, deactivate_vmap, copies and stacks the inputs too.)
     if isinstance(loss_module, SACLoss):
-        # In the place of vmap, as in our own losses; the numbers are the same. (TorchRL's own
-        # replacement, deactivate_vmap, copies and stacks the inputs too.)
         loss_module._vmap_qnetworkN0 = loss_module.qvalue_network.each
+    if isinstance(loss_module, TD3Loss):
+        loss_module._vmap_qvalue_network00 = partial(_each_on_the_same, loss_module.qvalue_network)
     return loss_module
+
+
+def _each_on_the_same(
+    network: Any, copies: TensorDictBase, params: TensorDictBase
+) -> TensorDictBase:
+    """What ``network.each`` gives on inputs that are repeated for each set of parameters."""
+    return network.each(copies[0], params)
+
+
+def compute_losses(
+    loss_module: LossModule, batch: TensorDictBase, with_policy: bool
+) -> TensorDictBase:
+    """The losses of a batch; TD3's, in an update that leaves the policy, without the policy's."""
+    if isinstance(loss_module, TD3Loss) and not with_policy:
+        return TensorDict(loss_qvalue=loss_module.value_loss(batch)[0])
+    return loss_module(batch)
 
 
 def make_temperatures(config: DictConfig, loss_module: LossModule) -> TemperatureScheduler:
