@@ -964,10 +964,14 @@ def test_forbidden_actions_have_no_part(distribution, name, tau):
 @losses
 @with_and_without_value
 @pytest.mark.parametrize("trailing", [False, True], ids=["[*B]", "[*B, 1]"])
-def test_masked_transitions_count_nothing(case, value, trailing):
+@pytest.mark.parametrize("weighted", [False, True], ids=["", "weighted"])
+def test_masked_transitions_count_nothing(case, value, trailing, weighted):
     """Whatever stands in them: values, gradients and metrics are those of the others."""
     loss = case.build(value=value, **{**LEARNED, "reduction": "mean"})
     real = _batch(case)
+    weights = torch.linspace(0.5, 2.0, 6).double()
+    if weighted:
+        real["priority_weight"] = weights
     spoilt = torch.cat([real, real.clone()])
     for key in spoilt.keys(True, True):
         if spoilt[key].is_floating_point():
@@ -995,7 +999,8 @@ def test_masked_transitions_count_nothing(case, value, trailing):
         assert output.isfinite().all(), name
         if name in REACHES:
             assert (output[6:] == 0).all(), name
-            assert_close(output[:6].mean(), expected[name], msg=name)
+            mean = output[:6].sum() / (weights.sum() if weighted else 6)
+            assert_close(mean, expected[name], msg=name)
 
     spoilt[MASK] = torch.zeros(12, dtype=torch.bool)
     nothing = loss(spoilt)

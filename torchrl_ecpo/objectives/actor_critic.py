@@ -543,7 +543,16 @@ class ActorCriticLoss(PolicyLoss):
         weights = None
         if self.use_prioritized_weights:
             weights = tensordict.get(self.tensor_keys.priority_weight, None)
-        return self._reduce_loss(loss, tensordict, weights=weights)
+        if weights is None:
+            return self._reduce_loss(loss, tensordict)
+        # TorchRL's weighted mean is NaN where the mask leaves nothing, its mean without weights 0;
+        # and it reads the weights of what is masked.
+        weights = self._reduce_loss(weights, tensordict, reduction="none")
+        if self.reduction != "mean":
+            return self._reduce_loss(loss, tensordict, weights=weights)
+        count = weights.sum()
+        total = self._reduce_loss(loss, tensordict, reduction="sum", weights=weights)
+        return total / count.where(count > 0, 1.0)
 
     def _report(self, metrics: dict[str, Tensor], tensordict: TensorDictBase) -> dict[str, Tensor]:
         """Means over the batch, or one number a state with ``reduction="none"``."""
