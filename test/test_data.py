@@ -6,7 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tensordict import TensorDict, assert_close
+from tensordict import NonTensorData, NonTensorStack, TensorDict, assert_close
 from torchrl.data import (
     LazyMemmapStorage,
     LazyTensorStorage,
@@ -76,6 +76,16 @@ class TestPack:
         groups = pack_groups(shuffled)
         assert groups["group"][:, 0, 0].tolist() == [0, 1]
         assert groups["x"].tolist() == [[[2, 3, 4], [6, 0, 0]], [[0, 1, 0], [5, 0, 0]]]
+
+    def test_what_is_no_tensor_goes_with_its_step(self):
+        steps = make_steps([(1, 2), (0, 3), (1, 1), (0, 1)])[torch.tensor([2, 0, 6, 3, 5, 1, 4])]
+        steps["next", "text"] = NonTensorStack(*(f"step {x}" for x in steps["x"].tolist()))
+        steps["task"] = NonTensorData("sums", batch_size=[7])
+        groups = pack_groups(steps)
+        real = unpack_groups(groups)
+        assert real["next", "text"] == [f"step {x}" for x in real["x"].tolist()]
+        assert groups["next", "text"][0][1] == ["step 6"] * 3  # its only step, then padding
+        assert groups["task"] == "sums"
 
     @given(
         st.lists(

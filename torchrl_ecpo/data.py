@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, is_leaf_nontensor, is_non_tensor
 from torch import Tensor
 from torchrl.data.replay_buffers import RoundRobinWriter, Storage, TensorStorage
 from torchrl.data.replay_buffers.samplers import Sampler
@@ -38,7 +38,8 @@ def pack_groups(
     """Arrange complete groups of trajectories as `[G, K, T]` with a mask of the real steps.
 
     Groups, and the trajectories of a group, keep the order in which they first appear; shorter
-    trajectories are padded with zeros at the end.
+    trajectories are padded with zeros at the end. Entries that are no tensors, such as texts,
+    repeat their last step there.
 
     Args:
         data: one of
@@ -284,15 +285,17 @@ def _pad(
     shape = torch.Size([start.numel() // group_size, group_size, int(length.max())])
     time = torch.arange(shape[-1], device=start.device)
     mask = time < length.unsqueeze(-1)
-    source = (start.unsqueeze(-1) + time)[mask]
-    source = source if order is None else order[source]
-    target = mask.reshape(-1).nonzero().squeeze(-1)
+    real_or_last = start.unsqueeze(-1) + time.minimum(length.unsqueeze(-1) - 1)
+    real_or_last = real_or_last if order is None else order[real_or_last]
+    source, target = real_or_last[mask], mask.reshape(-1).nonzero().squeeze(-1)
 
-    def place(value: Tensor) -> Tensor:
+    def place(value: Any) -> Any:
+        if is_non_tensor(value):
+            return value[real_or_last.reshape(-1)].reshape(shape)
         padded = value.new_zeros(mask.numel(), *value.shape[1:])
         return padded.index_copy_(0, target, value[source]).view(*shape, *value.shape[1:])
 
-    padded = steps.apply(place, batch_size=shape)
+    padded = steps.apply(place, batch_size=shape, is_leaf=is_leaf_nontensor)
     assert padded is not None
     return padded.set(mask_key, mask.view(shape))
 

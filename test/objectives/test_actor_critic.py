@@ -1157,13 +1157,17 @@ def test_returns_end_with_what_is_real(case, estimator, options):
 
 @losses
 def test_value_estimators_that_are_no_use(case):
-    """The loss has a soft value of its own, and needs no more than that."""
+    """The loss has a soft value of its own, needs no more than that, and keeps what it had."""
     loss = case.build()
+    before = loss.value_estimator
     network = ValueOperator(nn.Linear(OBSERVATION, 1), ["observation"])
     with pytest.raises(ValueError, match="TD0Estimator must have value_network=None"):
         loss.make_value_estimator(TD0Estimator(gamma=GAMMA, value_network=network))
     with pytest.raises(NotImplementedError, match=r"GAE is not implemented.*takes TD0Estimator"):
         loss.make_value_estimator(GAE(gamma=GAMMA, lmbda=0.9, value_network=None))
+    with pytest.raises(NotImplementedError, match="GAE is not implemented"):
+        loss.make_value_estimator(GAE, gamma=GAMMA, lmbda=0.9)
+    assert loss.value_estimator is before
 
 
 @losses

@@ -53,6 +53,7 @@ __all__ = ["ActorCriticLoss", "ContinuousActorCriticLoss", "DiscreteActorCriticL
 
 LOSS_FUNCTIONS = ("l2", "l1", "smooth_l1")
 SATURATED = 0.95
+ESTIMATORS = (TD0Estimator, TD1Estimator, TDLambdaEstimator)
 
 
 class Lift(NamedTuple):
@@ -649,30 +650,36 @@ class ActorCriticLoss(PolicyLoss):
             NotImplementedError: for an estimator that needs more than values.
             ValueError: for an estimator with a value network.
         """
+        if isinstance(value_type, type):
+            self._check_estimator(value_type, hyperparams.get("value_network"))
+        elif isinstance(value_type, ValueEstimatorBase):
+            self._check_estimator(type(value_type), value_type.value_network)
         resolved, options = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
-        if resolved is not None and options is not None:
-            dispatch_value_estimator(
-                self,
-                resolved,
-                supported=self.SUPPORTED_VALUE_ESTIMATORS,
-                tensor_keys=self._value_estimator_keys,
-                value_network=None,
-                **options,
-            )
+        if resolved is None or options is None:  # an estimator or its class, which is in place now
+            self._value_estimator.set_keys(**self._value_estimator_keys)
             return self
-        own = self._value_estimator
-        if not isinstance(own, (TD0Estimator, TD1Estimator, TDLambdaEstimator)):
-            raise NotImplementedError(
-                f"{type(own).__name__} is not implemented for {type(self).__name__}, which takes "
-                "TD0Estimator, TD1Estimator and TDLambdaEstimator."
-            )
-        if own.value_network is not None:
-            raise ValueError(
-                f"The {type(own).__name__} must have value_network=None: the loss itself computes "
-                "the soft value of the next state."
-            )
-        own.set_keys(**self._value_estimator_keys)
+        dispatch_value_estimator(
+            self,
+            resolved,
+            supported=self.SUPPORTED_VALUE_ESTIMATORS,
+            tensor_keys=self._value_estimator_keys,
+            value_network=None,
+            **options,
+        )
         return self
+
+    def _check_estimator(self, kind: type, value_network: Any) -> None:
+        if not issubclass(kind, ESTIMATORS):
+            takes = ", ".join(estimator.__name__ for estimator in ESTIMATORS)
+            raise NotImplementedError(
+                f"{kind.__name__} is not implemented for {type(self).__name__}, which takes "
+                f"{takes}."
+            )
+        if value_network is not None:
+            raise ValueError(
+                f"The {kind.__name__} must have value_network=None: the loss itself computes the "
+                "soft value of the next state."
+            )
 
     # ------------------------------------------------------------------------------------ critics
 
