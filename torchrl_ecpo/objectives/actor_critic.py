@@ -53,7 +53,7 @@ __all__ = ["ActorCriticLoss", "ContinuousActorCriticLoss", "DiscreteActorCriticL
 
 LOSS_FUNCTIONS = ("l2", "l1", "smooth_l1")
 SATURATED = 0.95
-ESTIMATORS = (TD0Estimator, TD1Estimator, TDLambdaEstimator)
+ESTIMATORS: tuple[type, ...] = (TD0Estimator, TD1Estimator, TDLambdaEstimator)
 
 
 class Lift(NamedTuple):
@@ -656,7 +656,7 @@ class ActorCriticLoss(PolicyLoss):
             self._check_estimator(type(value_type), value_type.value_network)
         resolved, options = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
         if resolved is None or options is None:  # an estimator or its class, which is in place now
-            self._value_estimator.set_keys(**self._value_estimator_keys)
+            self._forward_value_estimator_keys()
             return self
         dispatch_value_estimator(
             self,
