@@ -555,7 +555,7 @@ def test_a_heat_map_and_a_ranking(study, tmp_path, counter):
     path = plan(
         tmp_path,
         counter,
-        map={"methods": {"A": grid}, "kind": "heat_map", "steps": 100},
+        map={"methods": {"A": grid}, "kind": "heat_map", "steps": 100, "also": ["size"]},
         search={"methods": {"A": grid}, "kind": "ranking", "steps": 100},
         by_final={"methods": {"A": grid}, "kind": "ranking", "rank_by": "final", "steps": 100},
     )
@@ -563,15 +563,15 @@ def test_a_heat_map_and_a_ranking(study, tmp_path, counter):
     for name, entry in manifest.studies.items():
         results = study.results.Results(tmp_path / "results/study" / name)
         for value, cell in enumerate(manifest.cells(entry)[:3]):
-            metrics = {"step": [50, 100], "return": [10 * (2 - value), value]}
+            metrics = {"step": [50, 100], "return": [10 * (2 - value), value], "size": [3, 4]}
             record = SimpleNamespace(
                 **{"identity": {}, "seed": 1, "reached": 100, "unit": "frames", "finished": True},
                 **{"seconds": None, "versions": {}, "metrics": metrics},
             )
-            results.add(cell, record, ["return"])
+            results.add(cell, record, ["return", "size"])
         results.write()
     text, files = report(study, manifest, tmp_path, "docs")
-    assert {"map_one_a.svg", "map_one_a.png"} <= files.keys()
+    assert {"map_one_a.svg", "map_one_a.png", "map_one_a_size.svg"} <= files.keys()
     best = "speed 2, size 3: 2.0 (1 of 2 runs) | speed 1, size 4: 1.000 (1 of 2 runs)"
     assert f"| one | A | 3 of 4 | {best} | speed 1, size 3: 0.000 (1 of 2 runs) |" in text
     best = "speed 1, size 3: 10.0 (1 of 2 runs) | speed 1, size 4: 5.5 (1 of 2 runs)"

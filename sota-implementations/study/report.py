@@ -351,28 +351,30 @@ def curves_figure(
 
 
 def heat_maps(study: Study, cells: Sequence[CellResult], docs: Path) -> str:
-    """Final scores over the grid of each method on each task."""
+    """Final values over the grid of each method on each task."""
     return "\n\n".join(
-        heat_map(study, group, docs)
+        heat_map(study, group, docs, metric)
         for group in groups_of(cells)
+        for metric in (group[0].cell.task.metric, *study.also)
         if any(result.runs for result in group)
     )
 
 
-def heat_map(study: Study, group: Sequence[CellResult], docs: Path) -> str:
-    """Final scores over a grid."""
+def heat_map(study: Study, group: Sequence[CellResult], docs: Path, metric: str) -> str:
+    """Final values of a metric over a grid."""
     task, method = group[0].cell.task, group[0].cell.method
     axes = [
         (axis, list(dict.fromkeys(result.cell.setting[place][1] for result in group)))
         for place, (axis, _) in enumerate(group[0].cell.setting)
     ]
     shape = tuple(len(values) for _, values in axes)
-    means = [result.finals.mean() if result.runs else np.nan for result in group]
+    curves = [result.curve(metric) for result in group]
+    means = [np.nan if curve is None else final(*curve).mean() for curve in curves]
     texts = [
         f"{mean:.1f}\n({result.count})" if result.runs else "not run"
         for mean, result in zip(means, group, strict=True)
     ]
-    label = METRIC_LABELS.get(task.metric, task.metric)
+    label = METRIC_LABELS.get(metric, metric)
     picture = partial(
         plot_heat_map,
         np.reshape(means, shape),
@@ -381,7 +383,8 @@ def heat_map(study: Study, group: Sequence[CellResult], docs: Path) -> str:
         x_axis=axes[1],
         texts=np.reshape(texts, shape),
     )
-    name = f"{study.name}_{task.name}_{method.lower()}"
+    suffix = "" if metric == task.metric else f"_{metric}"
+    name = f"{study.name}_{task.name}_{method.lower()}{suffix}"
     return draw(name, docs, picture, f"{study.title}, {group[0].title}: final {label}")
 
 
