@@ -87,6 +87,10 @@ class TestPack:
         assert groups["next", "text"][0][1] == ["step 6"] * 3  # its only step, then padding
         assert groups["task"] == "sums"
 
+    def test_padding_among_flat_steps_is_left_out(self):
+        groups = pack_groups(make_steps(TRAJECTORIES))
+        assert_close(pack_groups(groups.reshape(-1)), groups, rtol=0, atol=0)
+
     @given(
         st.lists(
             st.tuples(st.integers(0, 99), st.lists(st.integers(1, 6), min_size=3, max_size=3)),
@@ -343,6 +347,18 @@ class TestSampler:
         buffer.extend(make_steps([(2, 5)], first_id=9, ended=False))
         with pytest.raises(RuntimeError, match=r"1 trajectories never ended.*StepCounter"):
             buffer.sample()
+
+    def test_padding_is_refused(self, storage):
+        groups = pack_groups(make_steps(TRAJECTORIES))
+        for padded, message in (
+            (groups, r"needs flat steps \[S\], got data of shape .*Write buffer.extend\(unpack"),
+            (groups.reshape(-1), r"hold padding .*Write buffer.extend\(unpack_groups"),
+        ):
+            with pytest.raises(ValueError, match=message):
+                make_buffer(storage=storage).extend(padded)
+        buffer = make_buffer(storage=storage)
+        buffer.extend(unpack_groups(groups))
+        assert buffer.sample().shape[:2] == (2, 2)
 
     def test_seeded_by_the_buffer(self, storage):
         draws = []

@@ -46,7 +46,8 @@ def pack_groups(
 
             - flat steps `[S]`, as ``Collector(trajs_per_batch=...)`` writes them to a buffer. A
               trajectory ends where `done_key` is set; `traj_key` tells trajectories apart whose
-              steps are interleaved. One of the two must be there.
+              steps are interleaved. One of the two must be there. Steps that `mask_key` marks as
+              padding are left out.
             - padded trajectories `[N, T]`, one to a row,
             - groups `[*G, K, T]`, which are checked and returned with their mask.
 
@@ -97,8 +98,12 @@ def pack_groups(
         start = length.cumsum(0) - length
         group, order = group[:, 0], None
     else:
+        mask = data.get(mask_key, None)
+        if mask is not None:
+            data = data.exclude(mask_key) if mask.all() else unpack_groups(data, mask_key=mask_key)
+            group = _integer_entry(data, group_key, "pack_groups")
         order, start, length = _find_trajectories(data, group, traj_key, done_key)
-        steps = data.exclude(mask_key)
+        steps = data
         group = group[start if order is None else order[start]]
         if order is not None:
             by_appearance = order[start].argsort()
@@ -350,7 +355,8 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
     :class:`~torchrl_ecpo.collectors.TrajectoryGroupCollector` write them. A batch has `G` distinct
     groups, uniformly drawn, and `K` distinct trajectories of each. Groups with fewer than `K`
     trajectories wait; of larger ones `K` are drawn. A trajectory that has not ended, or that the
-    writer has begun to overwrite, is never returned.
+    writer has begun to overwrite, is never returned. A group needs a number of its own for as long
+    as it is in the storage: trajectories that share one are drawn as one group.
 
     ``TensorDictReplayBuffer.sample()`` returns `[G, K, T]` with ``("collector", "mask")``; padded
     steps repeat the last real one. A plain ``ReplayBuffer`` puts the mask in the ``info`` of
@@ -377,8 +383,8 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
        counts steps, its ``PromptGroupSampler`` rows.)
 
     Raises:
-        ValueError: if `group_size` is below 2, the batch size is not `G * K`, or the storage has
-            more than one dimension.
+        ValueError: if `group_size` is below 2, the batch size is not `G * K`, the storage or what
+            is written has more than one dimension, or the steps written hold padding.
         TypeError: if the storage does not hold a tensordict.
         KeyError: when data without `group_key` or `done_key` is written.
         RuntimeError: at a draw, if there are fewer than `G` complete groups.
@@ -531,6 +537,17 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
         data = storage[:]
         if not isinstance(data, TensorDictBase):
             raise TypeError(f"{type(self).__name__} needs tensordicts, got {type(data).__name__}.")
+        if data.ndim != 1:
+            raise ValueError(
+                f"{type(self).__name__} needs flat steps [S], got data of shape "
+                f"{tuple(data.shape)}. Write buffer.extend(unpack_groups(data))."
+            )
+        mask = _per_step(data, MASK_KEY)
+        if mask is not None and not mask[index.to(mask.device)].all():
+            raise ValueError(
+                f"The steps hold padding ({MASK_KEY!r} is False), which would be taken for steps "
+                "of trajectories. Write buffer.extend(unpack_groups(data))."
+            )
         done = data.get(self.done_key, None)
         if done is None:
             raise KeyError(

@@ -115,6 +115,29 @@ def test_float32(case):
 
 
 @losses
+@pytest.mark.parametrize("autocast", [False, True], ids=["bfloat16", "autocast"])
+def test_half_precision(case, autocast):
+    """What an actor gives in half precision is added up, and reckoned with, in single precision."""
+    actor = make_actor(dtype=torch.float32 if autocast else torch.bfloat16)
+    batch = sample(actor, 1, 8, 300)
+    batch["next", "reward"] = torch.zeros(1, 8, 300, 1)
+    batch["next", "reward"][0, :, -1, 0] = returns = 10 + 0.01 * torch.arange(8)
+    batch["action_log_prob"] = batch["action_log_prob"].bfloat16()
+    loss = case.build(actor)
+    with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+        steps = actor.get_dist(batch).log_prob(batch["action"])
+        groups, out = loss._read(batch), loss(batch)
+    assert steps.dtype == torch.bfloat16
+    assert_close(groups.log_prob, steps.float().sum(-1))
+    assert_close(groups.behaviour_log_prob, batch["action_log_prob"].float().sum(-1))
+    assert_close(groups.returns, returns.unsqueeze(0))
+    for name, value in out.items():
+        assert value.dtype == torch.float32, name
+        assert value.isfinite(), name
+    assert_close(out["loss_actor"], loss.surrogate(groups).loss.mean())  # without autocast
+
+
+@losses
 @pytest.mark.parametrize("padded", [False, True], ids=["whole", "padded"])
 def test_integer_rewards(case, padded):
     """Everything is reckoned in the dtype of the log-probabilities."""

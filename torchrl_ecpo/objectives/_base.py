@@ -74,11 +74,15 @@ class PolicyLoss(LossModule):
         """Conjunction of the masks that :attr:`loss_mask_key` names, those that are there."""
         conjunction = None
         for key in self._loss_mask_keys():
-            if self.loss_mask_key != "auto":
-                get_entry(tensordict, key)
             mask = tensordict.get(key, None)
             if mask is None:
-                continue
+                if self.loss_mask_key == "auto":
+                    continue
+                raise KeyError(
+                    f"The mask {key!r} is missing, which loss_mask_key names; there are "
+                    f"{_present(tensordict)}. Assign another name to loss_mask_key, None to use no "
+                    "mask, or 'auto' for TorchRL's own where it is there."
+                )
             if mask.shape == (*shape, 1):
                 mask = mask.squeeze(-1)
             if mask.shape != shape:
@@ -115,12 +119,15 @@ def get_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
     """An entry that must be there."""
     value = tensordict.get(key, None)
     if value is None:
-        present = ", ".join(sorted(map(repr, tensordict.keys(True, True))))
         raise KeyError(
-            f"The entry {key!r} is missing; there are {present}. If it has another name, say so "
-            "with set_keys(...), or where the networks are built."
+            f"The entry {key!r} is missing; there are {_present(tensordict)}. If it has another "
+            "name, say so with set_keys(...), or where the networks are built."
         )
     return value
+
+
+def _present(tensordict: TensorDictBase) -> str:
+    return ", ".join(sorted(map(repr, tensordict.keys(True, True))))
 
 
 def as_float(name: str, value: Any) -> float:

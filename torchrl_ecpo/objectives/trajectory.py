@@ -66,6 +66,9 @@ class TrajectoryGroupLoss(PolicyLoss):
     :meth:`surrogate`, and reduces and reports what comes back. A new member of the family
     implements that one method.
 
+    Returns, log-probabilities and what follows from them are in single precision at least, also
+    where the actor is in half precision or under autocast.
+
     ``torch.compile(fullgraph=True)`` takes it with feed-forward actors; with recurrent ones PyTorch
     and TorchRL break the graph.
 
@@ -224,6 +227,9 @@ class TrajectoryGroupLoss(PolicyLoss):
             _check_padding(step_mask, self._loss_mask_keys())
 
         def over_steps(values: Tensor) -> Tensor:
+            # A sum over a completion of 1,000 tokens would be off by nats in half precision, and
+            # returns that differ by little would be equal.
+            values = values.to(torch.promote_types(values.dtype, torch.float32))
             return (values if step_mask is None else values.where(step_mask, 0.0)).sum(-1)
 
         recorded = self._recorded_log_prob(tensordict, shape)
