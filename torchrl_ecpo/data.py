@@ -82,11 +82,13 @@ def pack_groups(
         True
     """
     _check_group_size(group_size)
+    mask = data.get(mask_key, None)
+    if data.ndim == 1 and mask is not None and not mask.all():
+        data = unpack_groups(data, mask_key=mask_key)
     group = _integer_entry(data, group_key, "pack_groups")
     if data.ndim == 0:
         raise ValueError("pack_groups needs steps [S], trajectories [N, T] or groups [*G, K, T].")
     if data.ndim > 1:
-        mask = data.get(mask_key, None)
         if mask is None:
             mask = _mask_from_done(data, done_key, traj_key)
         _check_padded(mask, group, data.shape)
@@ -98,12 +100,8 @@ def pack_groups(
         start = length.cumsum(0) - length
         group, order = group[:, 0], None
     else:
-        mask = data.get(mask_key, None)
-        if mask is not None:
-            data = data.exclude(mask_key) if mask.all() else unpack_groups(data, mask_key=mask_key)
-            group = _integer_entry(data, group_key, "pack_groups")
         order, start, length = _find_trajectories(data, group, traj_key, done_key)
-        steps = data
+        steps = data.exclude(mask_key)
         group = group[start if order is None else order[start]]
         if order is not None:
             by_appearance = order[start].argsort()

@@ -162,15 +162,10 @@ def make_loss(config: DictConfig, actor: TensorDictModuleBase, env: EnvBase) -> 
     if isinstance(loss_module, SACLoss):
         loss_module._vmap_qnetworkN0 = loss_module.qvalue_network.each
     if isinstance(loss_module, TD3Loss):
-        loss_module._vmap_qvalue_network00 = partial(_each_on_the_same, loss_module.qvalue_network)
+        each = loss_module.qvalue_network.each
+        # TD3Loss repeats the inputs for each set of parameters.
+        loss_module._vmap_qvalue_network00 = lambda copies, params: each(copies[0], params)
     return loss_module
-
-
-def _each_on_the_same(
-    network: Any, copies: TensorDictBase, params: TensorDictBase
-) -> TensorDictBase:
-    """What ``network.each`` gives on inputs that are repeated for each set of parameters."""
-    return network.each(copies[0], params)
 
 
 def compute_losses(
