@@ -22,6 +22,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from rliable.metrics import probability_of_improvement
 
 STUDY = Path(__file__).parents[1] / "sota-implementations/study"
 MODULES = ("manifest", "records", "results", "scores", "run", "collect", "report")
@@ -124,7 +125,7 @@ def test_the_study_is_what_was_planned(study):
     assert runs["figure3_left"] == 2 * 5 * 10
     reported = {s for name in ("figure1", "figure2") for s in manifest.studies[name].seeds}
     searches = [entry for name, entry in manifest.studies.items() if name.startswith("search")]
-    assert len(searches) == 10
+    assert len(searches) == 14
     for search in searches:
         assert not reported & set(search.seeds), "searched on the reported seeds"
         cells = [(cell.task.name, cell.method) for cell in manifest.cells(search)]
@@ -134,8 +135,7 @@ def test_the_study_is_what_was_planned(study):
         if cell.task.script.startswith("ecpo"):
             methods[cell.task.name, cell.method] = methods.get((cell.task.name, cell.method), 0) + 1
     for (task, method), number in methods.items():
-        least = methods[task, "ECPO"]
-        assert number == least or (method.startswith("PMD") and number > least), (task, method)
+        assert number >= methods[task, "ECPO"], f"{method} has fewer settings than ECPO on {task}"
 
 
 @pytest.mark.slow
@@ -533,6 +533,8 @@ def test_the_report_is_the_same_each_time_and_says_what_is_missing(study, tmp_pa
     assert "| copy | B | `name=one speed=2` | 100 | **2 of 3 planned** | 1-2 | 1.5 |" in text
     # B: 2 of 3 runs; the mean of 91 to 100 hundredths of 4 and 3; never 5, of 100 steps.
     assert "| copy | B | 2 of 3 | 1.768 ± 0.252 | 3.3 ± 0.5 | 0% | > 100 |" in text
+    # On Reverse each of A's three runs is better than one of B's two, and two are worse than the other.
+    assert re.search(r"\| reverse \| B \| 0\.67 \(.*\) \| 0\.67 \(.*\) \|", text)
     # Slopes of 10, 9 and 8 are at 5 after 50, 56 and 63 steps.
     assert "| 100% | 56 |" in text
     assert "probability that A is better" in text
@@ -622,6 +624,7 @@ def test_the_last_tenth_is_a_tenth(study):
         ([[5.0], [5.0], [5.0]], ["100%", "1"]),
         ([[5.0], [1.0], [5.0]], ["67%", "1"]),
         ([[5.0], [1.0]], ["50%", "> 1"]),
+        ([[5.0], [5.0], [1.0], [5.0]], ["75%", "1"]),
         ([[1.0], [1.0]], ["0%", "> 1"]),
     ],
 )
@@ -641,6 +644,9 @@ def test_interquartile_mean_and_probability_of_improvement_by_hand(study):
     pairs = {"A": np.array([[3.0], [2.0]]), "B": np.array([[1.0], [2.0]])}
     better = study.scores.probabilities_of_improvement(pairs, "A")
     assert better["B"].value == (2 + 1 + 0.5) / 4
+    drawn = np.random.default_rng(0).integers(0, 5, (2, 6, 3)).astype(float)
+    better = study.scores.probabilities_of_improvement(dict(zip("AB", drawn, strict=True)), "A")
+    assert better["B"].value == pytest.approx(probability_of_improvement(*drawn))
 
 
 # -------------------------------------------------------------------------------------- really run

@@ -58,14 +58,19 @@ How to read the tables:
 - **runs**: those that made all steps. "3 of 25 planned": the others have not, or not to the end.
 - **area**: under the learning curve, over its length: the mean of the metric over the whole run.
 - **final**: mean of the metric over the last tenth of the run. Both with standard error over runs.
-- **solved**: share of runs that reached the threshold, on average over a hundredth of the run.
+- **solved**: share of runs that reached the threshold at any time, on average over a hundredth of
+  the run.
 - **steps to solve**: median over all runs; "> 240,000" if half of the runs or more never did.
-- **minutes a run**: of wall-clock time; of runs in one process, a share.
+- **minutes a run**: of wall-clock time, also where a run went on after these steps; of runs in one
+  process, a share.
 - Figures show the mean over runs and its standard error; the legend has the number of runs.
 - Intervals are 95 % intervals of a stratified bootstrap, by
   [rliable](https://github.com/google-research/rliable). The interquartile mean (IQM) is the mean of
-  the middle half of all runs on all tasks; the probability of improvement is that of a run of one
-  method ending above a run of another, mean over tasks.
+  the middle half of all runs on all tasks.
+- **better**: how likely a run of the first method has a larger area, or ends higher, than one of the
+  other, a tie counting half (the probability of improvement); over several tasks, the mean. Where
+  the interval has 0.5 in it, the runs leave open which is better. With two or three runs intervals
+  are too narrow.
 """
 
 Curve = tuple[np.ndarray, np.ndarray]
@@ -238,10 +243,8 @@ def scores(count: str, curve: Curve, threshold: float | None) -> list[str]:
     if threshold is None:
         return [*cells, "", ""]
     needed = steps_to_solve(*curve, threshold)
-    # The upper one of the middle two, which may be infinite.
-    median = np.sort(needed)[len(needed) // 2]
-    is_finite = np.isfinite(median)
-    text = f"{median:,.0f}" if is_finite else f"> {curve[0][-1]:,.0f}"
+    median = np.median(needed)
+    text = f"{median:,.0f}" if np.isfinite(median) else f"> {curve[0][-1]:,.0f}"
     return [*cells, f"{np.isfinite(needed).mean():.0%}", text]
 
 
@@ -280,6 +283,24 @@ def aggregates(study: Study, cells: Sequence[CellResult]) -> str:
         f"Final scores over {titles}, each in units of {unit}; of a method that has more runs on "
         "one task than on another, the first seeds:\n\n" + table(header, rows)
     )
+
+
+def comparisons(study: Study, cells: Sequence[CellResult]) -> str:
+    """How likely the first method is better than each other, on each task with runs to compare."""
+    first, *others = study.methods
+    compared = {(r.title, r.cell.method): r for r in cells if len(r.finals) > 1}
+    rows = []
+    for title in dict.fromkeys(result.title for result in cells):
+        runs = {m: compared[title, m] for m in study.methods if (title, m) in compared}
+        if first not in runs:
+            continue
+        by_area = {m: area(*r.scored)[:, None] for m, r in runs.items() if r.scored is not None}
+        by_final = {m: r.finals[:, None] for m, r in runs.items()}
+        better = [probabilities_of_improvement(scores, first) for scores in (by_area, by_final)]
+        rows += [(title, m, *(_interval(b[m]) for b in better)) for m in others if m in runs]
+    if not rows:
+        return ""
+    return table(("task", "other", f"{first} better by area", f"{first} better by final"), rows)
 
 
 def _interval(estimate: Estimate) -> str:
@@ -398,6 +419,7 @@ def section(study: Study, cells: Sequence[CellResult], docs: Path) -> str:
         parts = [
             curves_figure(study, cells, docs),
             scores_table(cells),
+            comparisons(study, cells),
             aggregates(study, cells),
             *(curves_figure(study, cells, docs, metric) for metric in study.also),
         ]
