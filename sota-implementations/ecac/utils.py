@@ -124,7 +124,7 @@ def _make_dm_control(config: DictConfig, **options: Any) -> EnvBase:
 def _missing(task: str, error: Exception) -> ModuleNotFoundError:
     return ModuleNotFoundError(
         f"{task} needs what is not installed: {error} For MuJoCo and dm_control: "
-        "pip install 'torchrl-ecpo[mujoco]'."
+        "pip install '.[mujoco]' in the repository."
     )
 
 

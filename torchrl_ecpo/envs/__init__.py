@@ -1,5 +1,6 @@
 """The paper's problems as batched TorchRL environments, and groups over any environment."""
 
+from torchrl_ecpo.envs._groups import GroupIdAllocator
 from torchrl_ecpo.envs.algorithmic import TASKS, AlgorithmicEnv, AlgorithmicTask
 from torchrl_ecpo.envs.bandit import BanditEnv
 from torchrl_ecpo.envs.grouped import GroupedEnv
@@ -12,6 +13,7 @@ __all__ = [
     "AlgorithmicTask",
     "BanditEnv",
     "EpisodeReplay",
+    "GroupIdAllocator",
     "GroupedEnv",
     "stack_envs",
 ]

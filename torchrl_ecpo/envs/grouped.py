@@ -42,7 +42,9 @@ class GroupedEnv(EnvBase):
     The seeds come from the operating system until ``set_seed`` is called, as gymnasium's do.
     Within a reset, torch's generators are seeded too and put back afterwards, so that environments
     written in torch start from the same state as well and the policy's randomness is untouched.
-    The copies' transitions may be random: only the start is shared.
+    What an environment draws later from the generator that its reset seeded, gymnasium's
+    ``np_random``, is shared too: equal actions of two copies then lead to equal trajectories.
+    Noise of their own must come from a generator that a reset does not seed.
 
     Raises:
         ValueError: if `group_size` is below 2, `num_groups` below 1, or a copy has a batch size.
