@@ -67,10 +67,10 @@ How to read the tables:
 - Intervals are 95 % intervals of a stratified bootstrap, by
   [rliable](https://github.com/google-research/rliable). The interquartile mean (IQM) is the mean of
   the middle half of all runs on all tasks.
-- **better**: how likely a run of the first method has a larger area, or ends higher, than one of the
-  other, a tie counting half (the probability of improvement); over several tasks, the mean. Where
-  the interval has 0.5 in it, the runs leave open which is better. With two or three runs intervals
-  are too narrow.
+- **better**: how likely a run of the first method has a larger area, or ends higher, than one of
+  the other, a tie counting half (the probability of improvement); over several tasks, the mean.
+  Where the interval has 0.5 in it, the runs leave open which is better. With two or three runs
+  intervals are too narrow.
 """
 
 Curve = tuple[np.ndarray, np.ndarray]
