@@ -112,7 +112,8 @@ def compose_command(script: Path, options: str) -> None:
 @pytest.mark.parametrize("page", [page for page in PAGES if python_blocks(page)], ids=name)
 def test_examples_run(page, tmp_path, monkeypatch):
     # As from the repository, but what they write stays out of it.
-    (tmp_path / "sota-implementations").symlink_to(ROOT / "sota-implementations")
+    for folder in ("docs", "sota-implementations"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
     monkeypatch.chdir(tmp_path)
     for script, options in commands(page):
         if "hydra.run.dir=" in options:  # the code of the page reads this run
