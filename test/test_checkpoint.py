@@ -335,8 +335,10 @@ def assert_same_steps(one, other):
 def test_where_a_run_goes(tmp_path, monkeypatch, resume, directory):
     monkeypatch.chdir(tmp_path)
     for name in ("2026-01-01", "2026-02-01"):
-        Path(name, "checkpoints").mkdir(parents=True)
-    Path("2026-03-01").mkdir()  # of a run that died before its first checkpoint
+        Path(name, "checkpoints/checkpoint-10").mkdir(parents=True)
+    # Of runs that died before their first checkpoint, and while it was written.
+    Path("2026-03-01").mkdir()
+    Path("2026-04-01/checkpoints/.checkpoint-10").mkdir(parents=True)
     assert Path(run_directory(resume, ".", "new")).resolve() == tmp_path / directory
     assert Path(run_directory("auto", "other", "new")) == Path("other/new")
     with pytest.raises(FileNotFoundError, match="resume=nowhere: there is nothing to resume from"):

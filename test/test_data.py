@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import random
 import re
 
 import pytest
@@ -52,6 +53,13 @@ TRAJECTORIES = [(5, 3), (5, 1), (2, 4), (2, 2), (9, 1), (9, 1)]
 
 
 class TestPack:
+    def test_unpacking_leaves_its_input_alone(self):
+        groups = pack_groups(make_steps(TRAJECTORIES))
+        groups["next", "info"] = TensorDict({}, groups.shape)
+        unpack_groups(groups.lock_())
+        assert groups.get(("next", "info")) is not None
+        assert groups.get(("collector", "mask")) is not None
+
     @pytest.mark.parametrize("traj_ids", [True, False])
     def test_flat_round_trip_is_exact(self, traj_ids):
         steps = make_steps(TRAJECTORIES, traj_ids=traj_ids)
@@ -327,6 +335,26 @@ class TestSampler:
         buffer.extend(make_steps([(3, 1)], first_id=10))
         assert sorted(buffer.sampler._members) == [3, 8]
         assert buffer.sampler._length[5] == 3
+
+    def test_a_trajectory_that_overwrites_its_own_beginning(self, storage):
+        """Whatever the fragments and the storage: a trajectory is drawn whole or not at all."""
+        draw = random.Random(0)
+        drawn = 0
+        for _ in range(40):
+            lengths = [draw.randint(1, 5) for _ in range(30)]
+            steps = make_steps([(7, length) for length in lengths])
+            buffer = make_buffer(draw.randint(5, 9), storage=storage, batch_size=2)
+            while len(steps):
+                part, steps = steps.split([min(5, len(steps)), max(0, len(steps) - 5)])
+                buffer.extend(part)
+                if not buffer.can_sample():
+                    continue
+                sample = buffer.sample()
+                for whole in unpack_groups(sample[:, :1]), unpack_groups(sample[:, 1:]):
+                    (trajectory,) = whole["collector", "traj_ids"].unique().tolist()
+                    assert whole["time"].tolist() == list(range(lengths[trajectory]))
+                    drawn += 1
+        assert drawn > 100
 
     def test_emptied_buffer(self, storage):
         buffer = make_buffer(storage=storage, batch_size=2)

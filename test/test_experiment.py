@@ -168,6 +168,17 @@ def test_compare_prints_a_table_and_writes_picture_and_curves(runs, capsys):
     assert lines[-1] == "urex,0,30,2"
 
 
+def test_comparison_refuses_runs_that_cannot_be_compared(runs):
+    with make_run(runs / "ecpo/2", make_config(loss={"name": "ecpo", "tau": 0.1})) as run:
+        run.log({"return": 1.0}, step=1000)
+    with pytest.raises(ValueError, match="ecpo have no steps in common: one ends at 30, another"):
+        load_comparison(find_runs([runs]), "return")
+    with make_run(runs / "late", make_config(loss={"name": "late", "tau": 0.1})) as run:
+        run.log({"return": float("nan")}, step=10)
+    with pytest.raises(ValueError, match=r"late has no value of 'return' yet"):
+        load_comparison(find_runs([runs / "late"]), "return")
+
+
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [

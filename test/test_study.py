@@ -343,6 +343,15 @@ def test_a_failure_is_reported_and_stops_nothing(run, tmp_path, counter):
     assert "RuntimeError: the disk of the test is full" in report
 
 
+def test_a_torn_file_of_one_run_stops_no_other(run, tmp_path, counter):
+    assert run(plan(tmp_path, counter, s={"seeds": "1"}))[0] == 0
+    for config in (tmp_path / "runs").rglob("config.yaml"):
+        config.write_text("seed: [")
+    status, output = run(plan(tmp_path, counter, s={"seeds": "1-2"}))
+    assert status == 1
+    assert "1 of 2 runs are done, 1 failed" in output
+
+
 def test_a_directory_with_another_configuration_is_not_touched(study, run, tmp_path, counter):
     path = plan(tmp_path, counter, s={"seeds": "1"})
     assert run(path)[0] == 0

@@ -130,7 +130,8 @@ def unpack_groups(data: TensorDictBase, *, mask_key: NestedKey = MASK_KEY) -> Te
     if mask is None:
         return data.reshape(-1)
     real = mask.reshape(-1).nonzero().squeeze(-1)
-    return data.exclude(mask_key).filter_empty_().reshape(-1)[real]
+    # A copy of the structure, from which empty entries go: what is nested in it is the caller's.
+    return data.exclude(mask_key).copy().filter_empty_().reshape(-1)[real]
 
 
 def _check_group_size(group_size: int | None) -> None:
@@ -571,8 +572,10 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
         tail_start, tail_length, tail_group, tail_id = tail
         same_id = tail_id is None if trajectory is None else tail_id == int(trajectory[0])
         if (tail_start + tail_length) % size == start[0] and tail_group == group[0] and same_id:
+            # What goes round to the trajectory's own beginning overwrites it: never whole.
+            is_overwritten = tail_length + int(length.sum()) > size
             start[0] = tail_start
-            length[0] += tail_length
+            length[0] += tail_length + size * is_overwritten
         else:
             self._unfinished += 1
 

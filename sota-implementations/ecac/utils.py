@@ -280,9 +280,8 @@ def make_replay_buffer(config: DictConfig) -> ReplayBuffer:
         storage=(
             LazyTensorStorage(size)
             if in_memory
-            else LazyMemmapStorage(
-                size, scratch_dir="replay_buffer", existsok=config.resume is not None
-            )
+            # Those of a run that is gone on from, or begun anew in its directory, are there.
+            else LazyMemmapStorage(size, scratch_dir="replay_buffer", existsok=True)
         ),
         batch_size=config.replay_buffer.batch_size,
         generator=torch.Generator().manual_seed(config.seed),

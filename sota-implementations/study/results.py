@@ -98,7 +98,8 @@ class Results:
     def _drop(self, cell: Cell) -> None:
         for key in list(self.runs):
             if key[:3] == (cell.task.name, cell.method, cell.label):
-                del self.runs[key], self.curves[key]
+                del self.runs[key]
+                self.curves.pop(key, None)  # none, of a run that was killed before its first point
 
 
 def thin(columns: Mapping[str, Sequence[float]], metrics: Sequence[str], steps: int) -> list[Point]:

@@ -207,8 +207,8 @@ class Queue:
                     self._report("is done", run)
                     return
                 command = run.command
-            except ValueError as error:
-                self._fail(run, str(error))
+            except Exception as error:  # whatever a torn file raises: the other runs go on
+                self._fail(run, f"{type(error).__name__}: {error}")
                 return
             with (run.directory / "log.txt").open("ab") as log:
                 process = subprocess.Popen(

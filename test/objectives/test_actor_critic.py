@@ -869,6 +869,27 @@ def test_pickle_and_deepcopy(case, value):
         assert_close(call(loss, batch), expected)
 
 
+def test_a_copy_of_a_compiled_loss_trains_itself():
+    """It is not compiled: what was compiled has the original's parameters."""
+    loss = CASES["ecac"].build()
+    loss.compile(backend="eager")
+    copy = deepcopy(loss)
+    call(copy, _batch(CASES["ecac"]))["loss_qvalue"].backward()
+    assert all(parameter.grad is None for parameter in loss.parameters())
+    assert any(parameter.grad is not None for parameter in copy.parameters())
+    pickle.dumps(loss)
+
+
+def test_a_learned_temperature_cannot_be_set_in_a_subclass_either():
+    class Scheduled(ECACLoss):
+        _schedulable_buffers = frozenset({"clip"})
+
+    networks = make_networks("tanh_normal")
+    loss = Scheduled(networks.actor, networks.qvalues)
+    with pytest.raises(AttributeError, match="tau is learned"):
+        loss.tau = 0.7
+
+
 def test_dropout_of_a_copy_is_its_own():
     """A copy calls its own Q network, not the original's."""
     networks = make_networks("tanh_normal")

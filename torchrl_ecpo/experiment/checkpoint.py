@@ -293,7 +293,7 @@ def run_directory(resume: str | None, parent: str, name: str) -> str:
     if resume is None:
         return f"{parent}/{name}"
     if resume == "auto":
-        runs = sorted(path.parent for path in Path(parent).glob(f"*/{FOLDER}"))
+        runs = sorted({path.parents[1] for path in Path(parent).glob(f"*/{FOLDER}/checkpoint-*")})
         return str(runs[-1] if runs else Path(parent, name))
     if not Path(resume).is_dir():
         raise FileNotFoundError(f"resume={resume}: there is nothing to resume from, no directory.")

@@ -96,11 +96,18 @@ def load_comparison(
         method = _method(run, by)
         steps, values = np.array(columns["step"]), np.array(columns[metric])
         measured = ~np.isnan(values)
+        if not measured.any():
+            raise ValueError(f"{run} has no value of {metric!r} yet: leave it out, or wait.")
         curves.setdefault(method, []).append((steps[measured], smooth(values[measured], smoothing)))
     common: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for method, pairs in curves.items():
         first = max(steps[0] for steps, _ in pairs)
         last = min(steps[-1] for steps, _ in pairs)
+        if first > last:
+            raise ValueError(
+                f"The runs of {method} have no steps in common: one ends at {last:,.0f}, another "
+                f"begins at {first:,.0f}. Compare runs that overlap."
+            )
         grid = np.linspace(last, first, points)[::-1]  # the last step, if there is only one point
         values = [v[np.searchsorted(steps, grid, side="right") - 1] for steps, v in pairs]
         common[method] = (grid, np.stack(values))

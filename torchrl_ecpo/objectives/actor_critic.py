@@ -531,7 +531,7 @@ class ActorCriticLoss(PolicyLoss):
     def __setattr__(self, name: str, value: Any) -> None:
         """Refuse a temperature that is learned, and one that is not allowed."""
         is_learned = f"log_{name}" in self.__dict__.get("_parameters", {})
-        if is_learned and name in self._schedulable_buffers:
+        if is_learned and name in type(self)._all_schedulable_buffers:
             raise AttributeError(
                 f"{name} is learned. Build the loss without "
                 f"{'target_kl' if name == 'tau' else 'target_entropy'} to set or schedule it."
@@ -685,7 +685,8 @@ class ActorCriticLoss(PolicyLoss):
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the vmapped function, which cannot be pickled and holds these networks."""
-        return {name: value for name, value in self.__dict__.items() if name != "_vmap_qvalue"}
+        state = super().__getstate__()
+        return {name: value for name, value in state.items() if name != "_vmap_qvalue"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Make the function anew, of the networks of the copy."""
