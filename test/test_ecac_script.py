@@ -203,9 +203,7 @@ def test_a_missing_simulator_is_named_with_its_extra(utils, monkeypatch):
     config = OmegaConf.create(
         {"env": {"kind": "gym", "name": "Ant-v5"}, "evaluation": {"video": 0}}
     )
-    with pytest.raises(
-        ModuleNotFoundError, match=r"Ant-v5 .* pip install '\.\[mujoco\]'"
-    ):
+    with pytest.raises(ModuleNotFoundError, match=r"Ant-v5 .* pip install '\.\[mujoco\]'"):
         utils.make_environment(config, seed=0)
 
 
