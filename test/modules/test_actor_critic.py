@@ -14,6 +14,7 @@ from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_ecpo.modules import (
     DenseNetwork,
+    actor_critic,
     make_deterministic_actor,
     make_qvalue_network,
     make_tanh_gaussian_actor,
@@ -69,8 +70,59 @@ def test_each_of_several_sets_of_parameters_gives_what_vmap_does():
     torch.testing.assert_close(*gradients)
 
 
-@pytest.mark.skipif(not torch.backends.mkldnn.is_available(), reason="PyTorch is without oneDNN")
-@pytest.mark.parametrize("batch_shape", [(), (16,), (0,), (3, 16)])
+@pytest.mark.parametrize("hidden", [[], [40]])
+@pytest.mark.parametrize(("repeated", "times"), [("", 0), ("a", 2), ("b", 2), ("ab", 0)])
+@pytest.mark.parametrize("batch_shape", [(8, 50), (8, 5, 10)])
+def test_what_is_repeated_is_multiplied_once(monkeypatch, hidden, repeated, times, batch_shape):
+    torch.manual_seed(0)
+    network = DenseNetwork(["a", "b"], ["out"], [5, *hidden, 2])
+    params = TensorDict.from_modules(network, DenseNetwork(["a", "b"], ["out"], [5, *hidden, 2]))
+    params = params.data.requires_grad_()
+    inputs = TensorDict(a=torch.randn(*batch_shape, 3), b=torch.randn(*batch_shape, 2))
+    for key in repeated:
+        inputs[key] = inputs[key][:1].expand_as(inputs[key])
+    copied = inputs.apply(torch.Tensor.contiguous)
+    rows = []
+
+    def product(x, *layer):
+        rows.append(len(x))
+        return torch.nn.functional.linear(x, *layer)
+
+    monkeypatch.setattr(actor_critic, "_product", product)
+    expected = network.each(copied, params)["out"]
+    assert set(rows) == {400}
+    rows.clear()
+    output = network.each(inputs, params)["out"]
+    assert rows.count(50) == times
+    assert set(rows) <= {50, 400}
+    torch.testing.assert_close(output, expected)
+    gradients = [
+        torch.autograd.grad(result.square().sum(), list(params.values()))
+        for result in (output, expected)
+    ]
+    torch.testing.assert_close(*gradients, atol=1e-4, rtol=1e-4)
+
+
+def test_what_is_repeated_and_has_a_gradient_gets_that_of_each_copy():
+    torch.manual_seed(0)
+    network = DenseNetwork(["a", "b"], ["out"], [5, 40, 2])
+    params = TensorDict.from_module(network)[None]
+    a, b = torch.randn(1, 50, 3).expand(8, 50, 3).requires_grad_(), torch.randn(8, 50, 2)
+    copy = a.detach().clone().requires_grad_()
+    gradients = [
+        torch.autograd.grad(network.each(TensorDict(a=x, b=b), params)["out"].square().sum(), x)
+        for x in (a, copy)
+    ]
+    torch.testing.assert_close(*gradients)
+
+
+needs_onednn = pytest.mark.skipif(
+    not torch.backends.mkldnn.is_available(), reason="PyTorch is without oneDNN"
+)
+
+
+@needs_onednn
+@pytest.mark.parametrize("batch_shape", [(), (64,), (0,), (16,), (3, 16)])
 def test_onednn_changes_no_more_than_the_rounding(monkeypatch, batch_shape):
     torch.manual_seed(0)
     network = DenseNetwork(["a"], ["out"], [5, 64, 64, 2])
@@ -83,12 +135,34 @@ def test_onednn_changes_no_more_than_the_rounding(monkeypatch, batch_shape):
         second = torch.autograd.grad(first[0].square().sum(), network.weight_1)
         return output, *first, *second
 
+    def uses_onednn(output):
+        return "_OneDNNLinearBackward" in {type(node).__name__ for node in _graph(output)}
+
     fast = output_and_gradients()
-    names = {type(node).__name__ for node in _graph(fast[0])}
-    assert ("_OneDNNLinearBackward" in names) == (batch_shape not in [(), (0,)])
-    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
+    assert uses_onednn(fast[0]) == (batch_shape in [(64,), (3, 16)])
+    monkeypatch.setattr(actor_critic, "_HAS_ONEDNN", False)
     plain = output_and_gradients()
+    assert not uses_onednn(plain[0])
     torch.testing.assert_close(fast, plain)
+
+
+@needs_onednn
+def test_onednn_is_given_no_gaps_between_rows(monkeypatch):
+    layouts = []
+
+    def onednn(x, weight, bias):
+        layouts.append(weight.is_contiguous() or weight.t().is_contiguous())
+        return torch.nn.functional.linear(x, weight, bias)
+
+    monkeypatch.setattr(actor_critic, "_onednn", onednn)
+    network = DenseNetwork(["a"], ["out"], [50, 64, 2])
+    network(a=torch.randn(64, 90)[:, :50]).sum().backward()
+    network(a=torch.randn(64, 2, 50)[:, 0]).sum().backward()
+    one = TensorDict.from_module(network)[None]
+    one["weight_0"] = torch.randn(1, 64, 90, requires_grad=True)[..., :50]
+    network.each(TensorDict(a=torch.randn(64, 50)), one)["out"].sum().backward()
+    assert len(layouts) == 6
+    assert all(layouts)
 
 
 def _graph(output):

@@ -21,6 +21,7 @@ from tensordict.nn import (
 )
 from torch import Tensor, nn
 from torch.autograd import Function
+from torch.library import custom_op
 from torch.nn.functional import linear
 from torchrl.data import Bounded, TensorSpec
 from torchrl.modules import ProbabilisticActor, TanhModule, TanhNormal
@@ -95,6 +96,9 @@ class DenseNetwork(TensorDictModuleBase):
         in the losses that have several Q networks. On a CPU it is faster than either: parameters
         are not swapped in and out of the module, and nothing but the outputs is stacked.
 
+        An entry that ``expand`` has repeated along the first dimension, as states are that have
+        several actions each, is multiplied by the first layer once.
+
         Args:
             tensordict: with the entries to read; left as it is.
             params: parameters by their names, stacked along the first dimension.
@@ -110,29 +114,29 @@ class DenseNetwork(TensorDictModuleBase):
             >>> network.each(TensorDict(observation=torch.zeros(5, 3)), twice)["state_value"].shape
             torch.Size([2, 5, 1])
         """
-        x = self._read(tensordict)
+        inputs = self._read(tensordict)
         sets = zip(*(params.get(name).unbind(0) for name in self._names), strict=True)
-        outputs = [self._compute(x, parameters) for parameters in sets]
+        outputs = [self._compute(inputs, parameters) for parameters in sets]
         return self._write(torch.stack(outputs), TensorDict())
 
     def _layers(self) -> Iterator[tuple[str, str, int, int]]:
         """Names of weight and bias of each layer, and its numbers of inputs and outputs."""
         return zip(self._names[::2], self._names[1::2], self.sizes, self.sizes[1:], strict=False)
 
-    def _read(self, tensordict: TensorDictBase) -> Tensor:
+    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
+        """The inputs side by side; if only some are repeated, each by itself."""
         inputs = [tensordict.get(key) for key in self.in_keys]
-        return torch.cat(inputs, -1) if len(inputs) > 1 else inputs[0]
+        if len(inputs) == 1 or len({_is_repeated(x) for x in inputs}) > 1:
+            return inputs
+        return [torch.cat(inputs, -1)]
 
     @staticmethod
-    def _compute(x: Tensor, parameters: Sequence[Tensor]) -> Tensor:
-        *hidden, last = zip(parameters[::2], parameters[1::2], strict=True)
-        batch_shape = x.shape[:-1]
-        if x.dim() > 2:
-            x = x.flatten(0, -2)
-        product = _fast_linear if _is_fast(x, parameters[0]) else linear
-        for weight, bias in hidden:
-            x = product(x, weight, bias).relu_()  # what goes into it is read by nobody else
-        x = linear(x, *last)
+    def _compute(inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:
+        (weight, bias), *others = zip(parameters[::2], parameters[1::2], strict=True)
+        x = _first_layer(inputs, weight, bias)
+        for weight, bias in others:
+            x = _product(x.relu_(), weight, bias)  # what goes into ReLU is read by nobody else
+        batch_shape = inputs[0].shape[:-1]
         return x.unflatten(0, batch_shape) if len(batch_shape) > 1 else x
 
     def _write(self, output: Tensor, tensordict: TensorDictBase) -> TensorDictBase:
@@ -142,45 +146,91 @@ class DenseNetwork(TensorDictModuleBase):
         return tensordict
 
 
+def _first_layer(inputs: Sequence[Tensor], weight: Tensor, bias: Tensor) -> Tensor:
+    """The product of a layer with inputs side by side, in rows; with what is repeated, once."""
+    if len(inputs) == 1:
+        return _product(_in_rows(inputs[0]), weight, bias)
+    shared, own = bias, list[Tensor]()
+    for x, columns in zip(inputs, weight.split([x.shape[-1] for x in inputs], -1), strict=True):
+        if _is_repeated(x):
+            shared = shared + _product(_in_rows(x[0]), columns, None)
+        else:
+            own.append(_product(_in_rows(x), columns, None))
+    total = sum(own[1:], own[0]).unflatten(0, (len(inputs[0]), -1))
+    return total.add_(shared).flatten(0, 1)
+
+
+def _is_repeated(x: Tensor) -> bool:
+    """Whether ``expand`` has made it, the same all along its first dimension, of data."""
+    return x.dim() > 2 and x.shape[0] > 1 and x.stride(0) == 0 and not x.requires_grad
+
+
+def _in_rows(x: Tensor) -> Tensor:
+    return x.flatten(0, -2) if x.dim() > 2 else x
+
+
+def _product(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    """``torch.nn.functional.linear``, by oneDNN where it can be and is worth it."""
+    return _fast_linear(x, weight, bias) if _is_fast(x, weight) else linear(x, weight, bias)
+
+
 class _OneDNNLinear(Function):
     """``torch.nn.functional.linear`` of matrices, by oneDNN.
 
-    PyTorch multiplies matrices in single precision by MKL. On an AMD EPYC, oneDNN takes half the
+    PyTorch multiplies matrices in single precision by MKL. On some AMD EPYC, oneDNN takes half the
     time for layers of 256 units and batches of 256. Results differ by rounding.
     """
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+        x, weight = _dense(x), _dense(weight)  # in the backward pass x stands where the weight does
         ctx.save_for_backward(x, weight)
-        return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "none", [], "")
+        return (_opaque if torch.compiler.is_compiling() else _onednn)(x, weight, bias)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,), (x, weight) = gradients, ctx.saved_tensors
         of_x, of_weight, of_bias = ctx.needs_input_grad
-        product = _fast_linear if _is_fast(gradient, weight) else linear  # vmap of gradients
         return (
-            product(gradient, weight.t(), None) if of_x else None,
-            product(gradient.t(), x.t(), None) if of_weight else None,
+            _product(gradient, weight.t(), None) if of_x else None,
+            _product(gradient.t(), x.t(), None) if of_weight else None,
             gradient.sum(0) if of_bias else None,
         )
 
+
+def _dense(matrix: Tensor) -> Tensor:
+    """Without gaps between rows or columns: with them oneDNN takes a thousand times as long."""
+    is_dense = matrix.is_contiguous() or matrix.t().is_contiguous()
+    return matrix if is_dense else matrix.contiguous()
+
+
+def _onednn(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "none", [], "")
+
+
+# The compiler, which has a form of its own for that operator, takes it for constant weights only.
+_opaque = custom_op("torchrl_ecpo::linear", _onednn, mutates_args=())
+_opaque.register_fake(lambda x, weight, bias: x.new_empty(x.shape[0], weight.shape[0]))
 
 _fast_linear: Callable[..., Tensor] = _OneDNNLinear.apply
 # The operator is PyTorch's own, but not a public one.
 _HAS_ONEDNN = torch.backends.mkldnn.is_available() and hasattr(
     torch.ops.mkldnn, "_linear_pointwise"
 )
+NARROW = 32
 
 
 def _is_fast(x: Tensor, weight: Tensor) -> bool:
-    """Whether :class:`_OneDNNLinear` can stand for ``linear``: eagerly, on floats of a CPU."""
+    """Whether :class:`_OneDNNLinear` can stand for ``linear``: on floats of a CPU, untransformed.
+
+    It takes longer for a few rows or outputs, as the last layer has them.
+    """
     return (
-        not torch.compiler.is_compiling()
-        and _HAS_ONEDNN
+        _HAS_ONEDNN
         and torch.backends.mkldnn.enabled
         and x.dim() == 2
-        and x.numel() > 0  # oneDNN refuses empty matrices
+        and min(x.shape[0], weight.shape[0]) > NARROW
+        and x.shape[1] > 0  # it refuses empty matrices
         and x.dtype == weight.dtype == torch.float32
         and x.device.type == "cpu"
         and not torch.is_autocast_enabled("cpu")

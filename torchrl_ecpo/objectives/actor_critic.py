@@ -846,8 +846,9 @@ class ContinuousActorCriticLoss(ActorCriticLoss):
     ) -> Tensor:
         """The least of the soft Q values ``[M, *B]`` of actions ``[M, *B, A]``."""
         shape = action.shape[:-1]
-        # Samples become more rows, not more steps, which a recurrent network would tell apart.
-        rows = (-1, *shape[2:])
+        # Samples become more rows, not more steps, which a recurrent network would tell apart. What
+        # has `each` keeps them apart from the states, which it need not read once for each sample.
+        rows = shape if hasattr(self.qvalue_network, "each") else (-1, *shape[2:])
         inputs = observations.select(*self._qvalue_observations).expand(shape).reshape(rows)
         inputs.set(self.tensor_keys.action, action.reshape(*rows, action.shape[-1]))
         qvalues = self._each_qvalue(inputs, qvalue_params, self.tensor_keys.state_action_value)

@@ -88,7 +88,8 @@ class ECACLoss(ContinuousActorCriticLoss):
             True and ``"auto"`` (default): if it is there.
         deactivate_vmap: if True, the Q networks are called one after another. Default: False.
             A network with a method ``each``, as :class:`~torchrl_ecpo.modules.DenseNetwork`, is
-            called by it in either case.
+            called by it in either case, with the samples along a first dimension ``[M, *B]``,
+            along which the states are expanded; other networks read them as more rows.
 
     The outputs are ``loss_actor``, ``loss_qvalue``, ``loss_value`` (with a value network),
     ``loss_tau`` and ``loss_tau_prime`` (where learned), each reaching its own parameters only, so
