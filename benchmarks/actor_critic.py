@@ -36,7 +36,7 @@ from torchrl_ecpo.experiment import compile_module
 SCRIPT = Path(__file__).resolve().parents[1] / "sota-implementations/ecac"
 sys.path.append(str(SCRIPT))
 
-from ecac import total  # noqa: E402 # pyright: ignore[reportMissingImports]
+from ecac import descend, total  # noqa: E402 # pyright: ignore[reportMissingImports]
 from utils import (  # noqa: E402 # pyright: ignore[reportMissingImports]
     make_actor,
     make_collector,
@@ -114,9 +114,7 @@ def random_batch(env_batch: TensorDictBase, size: int) -> TensorDict:
 
 def step(optimizer: torch.optim.Optimizer, losses: TensorDictBase) -> None:
     """The script's gradient step."""
-    total(losses, is_policy_due=True).backward()
-    optimizer.step()
-    optimizer.zero_grad()
+    descend(total(losses, is_policy_due=True), optimizer)
 
 
 def update(config: DictConfig, *, is_compiled: bool = False) -> Iteration:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import re
@@ -162,7 +163,8 @@ def utils(monkeypatch):
     import utils
 
     yield utils
-    sys.modules.pop("utils")
+    for name in ("utils", "ecac"):
+        sys.modules.pop(name, None)
 
 
 def test_an_unknown_task_is_refused_before_anything_starts(tmp_path):
@@ -257,7 +259,7 @@ def random_transitions():
 
 @pytest.mark.parametrize("loss", ["ecac", "pmd_ac", "sac", "sac_score", "td3"])
 def test_the_way_q_networks_are_called_changes_no_number(utils, monkeypatch, loss):
-    config = configure(["hidden_sizes=[16,16]", f"loss={loss}"])
+    config = configure(["hidden_sizes=[48,48]", f"loss={loss}"])
     env = utils.make_environment(config, seed=0)
     batch = random_transitions()
 
@@ -295,6 +297,36 @@ def test_an_update_that_leaves_the_policy_is_the_same_for_q(utils, loss):
 
     whole = loss_of_q_and_gradients(with_policy=True)
     torch.testing.assert_close(loss_of_q_and_gradients(with_policy=False), whole, rtol=0, atol=0)
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
+def test_a_compiled_update_that_leaves_the_policy_leaves_it(utils):
+    """As inductor does, this backend gives gradients of 0 where eagerly there are none."""
+    from ecac import descend, total
+
+    config = configure(["hidden_sizes=[16,16]", "loss=td3"])
+    env = utils.make_environment(config, seed=0)
+
+    def weights(*, is_compiled):
+        torch.manual_seed(0)
+        actor = utils.make_actor(config, env)
+        loss_module = utils.make_loss(config, actor, env)
+        utils.make_updater(config, loss_module)
+        optimizer = utils.make_optimizer(config.loss.lr, loss_module)
+        if is_compiled:
+            torch._dynamo.reset()
+            loss_module.compile(backend="aot_eager")
+        policies = []
+        for count in range(1, 5):
+            losses, is_due = loss_module(random_transitions()), count % 2 == 0
+            descend(total(losses, is_due), optimizer, kept=None if is_due else actor)
+            policies.append([parameter.detach().clone() for parameter in actor.parameters()])
+        return policies
+
+    policies = weights(is_compiled=False)
+    moved = [not torch.equal(a[0], b[0]) for a, b in itertools.pairwise(policies)]
+    assert moved == [True, False, True]
+    torch.testing.assert_close(weights(is_compiled=True), policies, atol=1e-4, rtol=1e-4)
 
 
 def test_adam_has_a_group_for_each_learning_rate(utils):

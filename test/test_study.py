@@ -174,6 +174,9 @@ def test_a_choice_of_studies_tasks_methods_and_seeds(study, tmp_path, counter):
             manifest.select(**wrong)
     with pytest.raises(ValueError, match="No run is left"):
         manifest.select(seeds=[7])
+    path = plan(tmp_path, counter, tasks=tasks, s=both, t={**both, "seeds": "1-3"})
+    chosen = study.manifest.read_manifests([path]).select(seeds=[3])
+    assert [(c.study, c.seeds) for c in chosen] == [("t", (3,))] * 4
 
 
 @pytest.mark.parametrize(
@@ -487,6 +490,27 @@ def test_results_stay_unless_a_run_went_further_or_the_cell_has_changed(
     results = collect(study, tmp_path, changed)
     assert list(results.runs) == [("one", "A", "", 1)]
     assert "results of one/A are dropped, for speed was 1.0, is 2.0" in capfd.readouterr().out
+
+
+def test_what_has_results_is_not_missing(study, run, tmp_path, counter, capfd):
+    path = plan(tmp_path, counter, s={})
+    make_runs(run, path)
+    collect(study, tmp_path, path)
+    capfd.readouterr()
+
+    def missing(*options, **entries):
+        path = plan(tmp_path, counter, s={"seeds": "1-3", **entries})
+        arguments = ("--missing", "--results", str(tmp_path / "results"), "--dry-run")
+        status, output = run(path, "--runs", str(tmp_path / "elsewhere"), *arguments, *options)
+        assert status == 0
+        return [line.split()[3:-1] for line in output.splitlines()]
+
+    every = [["1"], ["2"], ["3"]]
+    assert missing() == [["3"]]
+    assert missing(seeds="1-2") == []
+    assert missing(steps=5) == every
+    assert missing(methods={"A": "speed=2.0"}) == every
+    assert missing("--ignore", "speed", methods={"A": "speed=2.0"}) == [["3"]]
 
 
 def synthetic(study, tmp_path, counter, curves, steps=100, **entries):

@@ -9,7 +9,7 @@ import hydra
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from utils import (
     SHOWN,
     BufferState,
@@ -45,6 +45,15 @@ def total(losses: TensorDictBase, is_policy_due: bool) -> Tensor:
         if name.startswith("loss_") and (is_policy_due or name != "loss_actor")
     ]
     return torch.stack(trained).sum()
+
+
+def descend(loss: Tensor, optimizer: torch.optim.Optimizer, kept: nn.Module | None = None) -> None:
+    """A gradient step, which leaves a module as it is."""
+    loss.backward()
+    if kept is not None:
+        kept.zero_grad()  # compiled, it has a gradient of 0, not none, by which Adam still moves
+    optimizer.step()
+    optimizer.zero_grad()
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
@@ -112,9 +121,7 @@ def main(config: DictConfig) -> None:
                     loss = total(losses, is_policy_due)
                     if not loss.isfinite():
                         run.check(scalars(losses), progress.frames)
-                    loss.backward()
-                    optimizer.step()
-                    optimizer.zero_grad()
+                    descend(loss, optimizer, kept=None if is_policy_due else actor)
                     progress.updates += 1
                     if is_policy_due:
                         updater.step()

@@ -210,15 +210,15 @@ class Manifest:
         _check_names("--methods", methods, {cell.method for cell in cells})
         wanted = set(seeds)
         selected = [
-            dataclasses.replace(
-                cell, seeds=tuple(seed for seed in cell.seeds if not wanted or seed in wanted)
-            )
+            dataclasses.replace(cell, seeds=own)
             for cell in cells
-            if (not only or cell.study in only)
+            for own in [tuple(seed for seed in cell.seeds if not wanted or seed in wanted)]
+            if own
+            and (not only or cell.study in only)
             and (not tasks or cell.task.name in tasks)
             and (not methods or cell.method in methods)
         ]
-        if not any(cell.seeds for cell in selected):
+        if not selected:
             raise ValueError("No run is left by this choice of names and seeds.")
         return selected
 

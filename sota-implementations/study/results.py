@@ -68,8 +68,7 @@ class Results:
         Runs of the cell that were made with another configuration are dropped, but for entries
         that are ignored.
         """
-        # A cell has one configuration but for the seed, after which the bandit's instance is named.
-        config = {k: value for k, value in record.identity.items() if not k.endswith("seed")}
+        config = _but_for_the_seed(record.identity)
         changes = changed_entries(self.configs.get(cell.name, config), config, ignored)
         if changes:
             print(
@@ -94,6 +93,14 @@ class Results:
         }
         self.runs[key] = {name: str(value) for name, value in values.items()}
         return True
+
+    def has(self, cell: Cell, seed: int, ignored: Sequence[str] = ()) -> bool:
+        """Whether a run of the cell as it is now is there, with all its steps."""
+        run = self.runs.get((cell.task.name, cell.method, cell.label, seed))
+        if run is None or int(run["reached"]) < cell.steps:
+            return False
+        config = _but_for_the_seed(cell.identity(seed))
+        return not changed_entries(self.configs[cell.name], config, ignored)
 
     def _drop(self, cell: Cell) -> None:
         for key in list(self.runs):
@@ -130,6 +137,11 @@ def thin(columns: Mapping[str, Sequence[float]], metrics: Sequence[str], steps: 
         if len(point) > 1:
             points.append(point)
     return points
+
+
+def _but_for_the_seed(identity: Mapping[str, float | str]) -> dict[str, float | str]:
+    """What the runs of a cell share; the bandit's instance is named after the seed too."""
+    return {name: value for name, value in identity.items() if not name.endswith("seed")}
 
 
 def _key(row: Mapping[str, str]) -> Key:

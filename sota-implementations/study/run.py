@@ -3,7 +3,7 @@
 ``python run.py --only figure1 --tasks copy,reverse --seeds 1-3``. What is done is skipped. Ctrl-C
 or SIGTERM lets each run write a checkpoint; the same command goes on from there, also after a kill.
 ``--stack 5`` makes up to five runs of a cell in one process, where the script can. Runs that have
-begun go on as they were begun.
+begun go on as they were begun. ``--missing`` makes none whose results are committed.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from manifest import (
     read_manifests,
 )
 from records import Record, find_record
+from results import RESULTS, Results
 
 POLL = 0.2  # seconds
 LOG_LINES = 12
@@ -125,6 +126,22 @@ def planned_runs(
             runs.append(Run(longest, seeds, base / "_".join([kind, *map(str, seeds)]), ignored))
     places = {seed: place for cell in cells for place, seed in enumerate(cell.seeds)}
     return sorted(runs, key=lambda run: min(places[s] for s in run.seeds if s in places))
+
+
+def without_results(
+    cells: Sequence[Cell], results: Path, ignored: Sequence[str] = ()
+) -> list[Cell]:
+    """The cells with those seeds whose results are not committed."""
+    committed = {
+        study: Results.read(results / "study" / study)
+        for study in dict.fromkeys(cell.study for cell in cells)
+    }
+    left = []
+    for cell in cells:
+        has = committed[cell.study].has
+        seeds = tuple(seed for seed in cell.seeds if not has(cell, seed, ignored))
+        left += [dataclasses.replace(cell, seeds=seeds)] if seeds else []
+    return left
 
 
 def begun(base: Path) -> list[tuple[int, ...]]:
@@ -276,6 +293,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     parser.add_argument("--workers", type=int, default=cores, help="runs at a time")
     parser.add_argument("--stack", type=int, default=1, help="runs of a cell in one process")
+    parser.add_argument("--missing", action="store_true", help="only runs without results yet")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="what is committed")
     parser.add_argument("--dry-run", action="store_true", help="list the runs")
     options = parser.parse_args(arguments)
     for name in ("workers", "stack"):
@@ -284,6 +303,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         manifest = read_manifests(options.manifest)
         cells = manifest.select(options.only, options.tasks, options.methods, options.seeds)
+        if options.missing:
+            cells = without_results(cells, options.results, options.ignore)
         runs = planned_runs(cells, options.runs.resolve(), options.ignore, options.stack)
         for cell in cells:
             assert cell.config, "composed once before anything is run, so that a mistake shows"

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from functorch.compile import make_boxed_func
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torch._dynamo.backends.common import aot_autograd
 from torchrl.data import Bounded, OneHot
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import MLP
@@ -51,12 +53,14 @@ def test_a_dense_network_computes_what_an_mlp_does(hidden, dtype):
     torch.testing.assert_close(network(a=td["a"], b=td["b"]), expected)
 
 
-def test_each_of_several_sets_of_parameters_gives_what_vmap_does():
+@pytest.mark.parametrize(("rows", "units"), [(4, 8), (64, 64)])
+def test_each_of_several_sets_of_parameters_gives_what_vmap_does(rows, units):
     torch.manual_seed(0)
-    network = DenseNetwork(["a", "b"], ["out"], [5, 8, 2])
-    params = TensorDict.from_modules(network, DenseNetwork(["a", "b"], ["out"], [5, 8, 2]))
+    network = DenseNetwork(["a", "b"], ["out"], [60, units, 2])
+    params = TensorDict.from_modules(network, DenseNetwork(["a", "b"], ["out"], [60, units, 2]))
     params = params.data.requires_grad_()
-    inputs = TensorDict({"a": torch.randn(4, 3), "b": torch.randn(4, 2, requires_grad=True)}, [4])
+    b = torch.randn(rows, 20, requires_grad=True)
+    inputs = TensorDict({"a": torch.randn(rows, 40), "b": b}, [rows])
 
     def call(params):
         with params.to_module(network, preserve_module_state=False):
@@ -67,21 +71,29 @@ def test_each_of_several_sets_of_parameters_gives_what_vmap_does():
     torch.testing.assert_close(*outputs)
     leaves = [inputs["b"], *params.values()]
     gradients = [torch.autograd.grad(output.square().sum(), leaves) for output in outputs]
-    torch.testing.assert_close(*gradients)
+    torch.testing.assert_close(*gradients, atol=1e-4, rtol=1e-4)
+
+
+def two_sets(*hidden):
+    """A network of two inputs of 40 and 36 numbers, and two sets of parameters."""
+    torch.manual_seed(0)
+    networks = [DenseNetwork(["a", "b"], ["out"], [76, *hidden, 2]) for _ in range(2)]
+    return networks[0], TensorDict.from_modules(*networks).data.requires_grad_()
+
+
+def repeated_inputs(keys, *batch_shape):
+    inputs = TensorDict(a=torch.randn(*batch_shape, 40), b=torch.randn(*batch_shape, 36))
+    for key in keys:
+        inputs[key] = inputs[key][:1].expand_as(inputs[key])
+    return inputs
 
 
 @pytest.mark.parametrize("hidden", [[], [40]])
 @pytest.mark.parametrize(("repeated", "times"), [("", 0), ("a", 2), ("b", 2), ("ab", 0)])
 @pytest.mark.parametrize("batch_shape", [(8, 50), (8, 5, 10)])
 def test_what_is_repeated_is_multiplied_once(monkeypatch, hidden, repeated, times, batch_shape):
-    torch.manual_seed(0)
-    network = DenseNetwork(["a", "b"], ["out"], [5, *hidden, 2])
-    params = TensorDict.from_modules(network, DenseNetwork(["a", "b"], ["out"], [5, *hidden, 2]))
-    params = params.data.requires_grad_()
-    inputs = TensorDict(a=torch.randn(*batch_shape, 3), b=torch.randn(*batch_shape, 2))
-    for key in repeated:
-        inputs[key] = inputs[key][:1].expand_as(inputs[key])
-    copied = inputs.apply(torch.Tensor.contiguous)
+    network, params = two_sets(*hidden)
+    inputs = repeated_inputs(repeated, *batch_shape)
     rows = []
 
     def product(x, *layer):
@@ -89,7 +101,7 @@ def test_what_is_repeated_is_multiplied_once(monkeypatch, hidden, repeated, time
         return torch.nn.functional.linear(x, *layer)
 
     monkeypatch.setattr(actor_critic, "_product", product)
-    expected = network.each(copied, params)["out"]
+    expected = network.each(inputs.contiguous(), params)["out"]
     assert set(rows) == {400}
     rows.clear()
     output = network.each(inputs, params)["out"]
@@ -104,16 +116,43 @@ def test_what_is_repeated_is_multiplied_once(monkeypatch, hidden, repeated, time
 
 
 def test_what_is_repeated_and_has_a_gradient_gets_that_of_each_copy():
-    torch.manual_seed(0)
-    network = DenseNetwork(["a", "b"], ["out"], [5, 40, 2])
-    params = TensorDict.from_module(network)[None]
-    a, b = torch.randn(1, 50, 3).expand(8, 50, 3).requires_grad_(), torch.randn(8, 50, 2)
-    copy = a.detach().clone().requires_grad_()
-    gradients = [
-        torch.autograd.grad(network.each(TensorDict(a=x, b=b), params)["out"].square().sum(), x)
-        for x in (a, copy)
-    ]
+    network, params = two_sets(40)
+    inputs = repeated_inputs("a", 8, 50)
+    b = inputs["b"]
+
+    def output(a):
+        return network.each(TensorDict(a=a, b=b), params)["out"].square().sum()
+
+    a, copy = (x.requires_grad_() for x in (inputs["a"], inputs["a"].contiguous()))
+    gradients = [torch.autograd.grad(output(x), x) for x in (a, copy)]
     torch.testing.assert_close(*gradients)
+    several = torch.func.grad(lambda a: torch.vmap(output)(a).sum())
+    expanded = copy.detach()[:1].expand(4, 8, 50, 40)
+    torch.testing.assert_close(several(expanded), several(expanded.contiguous()))
+
+
+def test_what_is_repeated_may_be_mapped_over():
+    network, params = two_sets(40)
+    inputs, states = repeated_inputs("", 8, 50), torch.randn(3, 50, 40)
+
+    def output(state):
+        a = state.expand(8, 50, 40)
+        return network.each(TensorDict(a=a, b=inputs["b"]), params)["out"]
+
+    expected = torch.stack([output(state) for state in states])
+    torch.testing.assert_close(torch.vmap(output)(states), expected)
+
+
+def test_what_is_repeated_is_read_as_its_copy_would_be():
+    network, params = two_sets(40)
+    inputs = repeated_inputs("a", 8, 50)
+    whole = TensorDict(a=inputs["a"], b=inputs["b"].gt(0))
+    copied = TensorDict(a=inputs["a"].contiguous(), b=whole["b"])
+    outputs = [network.each(entries, params)["out"] for entries in (whole, copied)]
+    torch.testing.assert_close(*outputs)
+    for shape in ((16, 25, 36), (400, 36), (8, 25, 2, 36)):
+        with pytest.raises(RuntimeError, match=r"Sizes of tensors must match|same number of dim"):
+            network.each(TensorDict(a=inputs["a"], b=torch.zeros(shape)), params)
 
 
 needs_onednn = pytest.mark.skipif(
@@ -122,17 +161,21 @@ needs_onednn = pytest.mark.skipif(
 
 
 @needs_onednn
+@pytest.mark.parametrize("gaps", [False, True])
 @pytest.mark.parametrize("batch_shape", [(), (64,), (0,), (16,), (3, 16)])
-def test_onednn_changes_no_more_than_the_rounding(monkeypatch, batch_shape):
+def test_onednn_changes_no_more_than_the_rounding(monkeypatch, batch_shape, gaps):
     torch.manual_seed(0)
-    network = DenseNetwork(["a"], ["out"], [5, 64, 64, 2])
-    inputs = torch.randn(*batch_shape, 5, requires_grad=True)
+    network = DenseNetwork(["a"], ["out"], [50, 64, 64, 2])
+    inputs = torch.randn(*batch_shape, 90, requires_grad=True)
     leaves = [inputs, *network.parameters()]
 
     def output_and_gradients():
-        output = network(a=inputs)
+        output = network(a=inputs[..., :50] if gaps else inputs[..., :50].contiguous())
         first = torch.autograd.grad(output.square().sum(), leaves, create_graph=True)
-        second = torch.autograd.grad(first[0].square().sum(), network.weight_1)
+        second = [
+            torch.autograd.grad(gradient.square().sum(), network.weight_1, retain_graph=True)[0]
+            for gradient in first[:2]
+        ]
         return output, *first, *second
 
     def uses_onednn(output):
@@ -143,7 +186,29 @@ def test_onednn_changes_no_more_than_the_rounding(monkeypatch, batch_shape):
     monkeypatch.setattr(actor_critic, "_HAS_ONEDNN", False)
     plain = output_and_gradients()
     assert not uses_onednn(plain[0])
-    torch.testing.assert_close(fast, plain)
+    torch.testing.assert_close(fast, plain, atol=1e-4, rtol=1e-4)
+
+
+@needs_onednn
+def test_second_derivatives_by_what_is_repeated(monkeypatch):
+    network, params = two_sets(40)
+    inputs = repeated_inputs("a", 8, 50)
+    inputs["b"].requires_grad_()
+
+    def second():
+        output = network.each(inputs, params)["out"]
+        (first,) = torch.autograd.grad(output.square().sum(), inputs["b"], create_graph=True)
+        return torch.autograd.grad(first.square().sum(), list(params.values()), allow_unused=True)
+
+    fast = second()
+    monkeypatch.setattr(actor_critic, "_HAS_ONEDNN", False)
+    torch.testing.assert_close(fast, second(), atol=1e-4, rtol=1e-4)
+
+
+@needs_onednn
+def test_inputs_of_another_length_are_refused_in_torch_s_words():
+    with pytest.raises(RuntimeError, match=r"shapes cannot be multiplied \(64x70 and 50x64\)"):
+        DenseNetwork(["a"], ["out"], [50, 64, 2])(a=torch.zeros(64, 70))
 
 
 @needs_onednn
@@ -173,10 +238,40 @@ def _graph(output):
 
 
 def test_other_precisions_are_left_to_torch():
-    network = DenseNetwork(["a"], ["out"], [5, 8, 2])
+    network = DenseNetwork(["a"], ["out"], [50, 64, 2])
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        assert network(a=torch.zeros(3, 5)).dtype == torch.bfloat16
-    assert network.double()(a=torch.zeros(3, 5).double()).dtype == torch.float64
+        assert network(a=torch.zeros(64, 50)).dtype == torch.bfloat16
+    assert network.double()(a=torch.zeros(64, 50).double()).dtype == torch.float64
+
+
+@needs_onednn
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
+def test_a_dense_network_compiles_as_a_whole_and_by_onednn():
+    network, params = two_sets(40)
+    inputs = repeated_inputs("a", 8, 50)
+    graphs = []
+
+    def keep(graph, example_inputs):
+        graphs.append(graph)
+        return make_boxed_func(graph.forward)
+
+    def update(entries):
+        output = network.each(entries, params)["out"]
+        return output, output.square().sum()
+
+    expected, total = update(inputs)
+    torch._dynamo.reset()
+    backend = aot_autograd(fw_compiler=keep, bw_compiler=keep)
+    output, compiled_total = torch.compile(update, fullgraph=True, backend=backend)(inputs)
+    torch.testing.assert_close(output, expected)
+    leaves = list(params.values())
+    gradients = [torch.autograd.grad(value, leaves) for value in (compiled_total, total)]
+    torch.testing.assert_close(*gradients, atol=1e-4, rtol=1e-4)
+    products = [
+        sum(node.target is torch.ops.torchrl_ecpo.linear.default for node in graph.graph.nodes)
+        for graph in graphs
+    ]
+    assert products == [4, 4]  # of two networks with a and b, and of the gradients of their weights
 
 
 def test_a_dense_network_starts_as_layers_of_torch_do():

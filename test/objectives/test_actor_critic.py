@@ -28,11 +28,16 @@ from actor_critic_problems import (
     total,
 )
 from tensordict import TensorDict, TensorDictParams
-from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
+from tensordict.nn import (
+    NormalParamExtractor,
+    TensorDictModule,
+    TensorDictModuleWrapper,
+    TensorDictSequential,
+)
 from torch import nn
 from torch.distributions import Bernoulli, Categorical, Normal
 from torch.testing import assert_close
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import Bounded, LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import ExplorationType, MultiStepTransform, set_exploration_type
 from torchrl.envs.utils import exploration_type
 from torchrl.modules import (
@@ -57,6 +62,7 @@ from torchrl_ecpo import (
     TemperatureScheduler,
     UpdaterSequence,
 )
+from torchrl_ecpo.modules import make_qvalue_network, make_tanh_gaussian_actor
 from torchrl_ecpo.schedules import linear
 
 losses = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
@@ -1821,6 +1827,47 @@ def test_saturated_actions(case, dtype):
     assert all(g.isfinite().all() for g in gradients(loss, total(outputs)).values())
 
 
+def _dense_case(**options):
+    """ECACLoss with the package's networks, wide enough for what makes them fast."""
+    torch.manual_seed(0)
+    spec = Bounded(-1.0, 1.0, shape=(2,))
+    actor = make_tanh_gaussian_actor(40, spec, hidden_sizes=[40])
+    qvalue = make_qvalue_network(40, 2, hidden_sizes=[40])
+    loss = ECACLoss(actor, options.pop("wrap", lambda network: network)(qvalue), **options)
+    SoftUpdate(loss, tau=0.1)
+    never = torch.zeros(50, 1, dtype=torch.bool)
+    batch = TensorDict(
+        observation=torch.randn(50, 40),
+        action=torch.rand(50, 2),
+        next={
+            "observation": torch.randn(50, 40),
+            "reward": torch.randn(50, 1),
+            "done": never,
+            "terminated": never.clone(),
+        },
+        batch_size=[50],
+    )
+    return loss, batch
+
+
+def test_a_wrapped_network_is_not_taken_for_what_it_wraps():
+    values = []
+    for wrap in (lambda network: network, TensorDictModuleWrapper):
+        loss, batch = _dense_case(wrap=wrap)
+        for parameter in loss.qvalue_network_params.values(True, True):
+            parameter.data.fill_(0.01)
+        SoftUpdate(loss, tau=0.1)
+        torch.manual_seed(1)
+        values.append(loss(batch)["qvalue"])
+    assert_close(*values)
+
+
+def test_the_first_states_of_a_single_transition_are_refused():
+    loss, batch = _dense_case(num_actor_states=4)
+    with pytest.raises(ValueError, match="num_actor_states=4 takes the first of a batch"):
+        loss(batch[0])
+
+
 # ----------------------------------------------------------------------------------------- compile
 
 
@@ -1867,6 +1914,18 @@ ALL = {"value": True, "delay_actor": True, **LEARNED}
 def test_compile(name, options):
     with torch._dynamo.config.patch(error_on_recompile=False):
         _assert_compiled_is_eager(CASES[name], "eager", **options)
+
+
+@compiler_warnings
+def test_compile_with_dense_networks():
+    torch._dynamo.reset()
+    loss, batch = _dense_case(num_actor_states=40)
+    compiled = torch.compile(loss, fullgraph=True, backend="eager")
+    outputs = []
+    for update in (loss, compiled):
+        torch.manual_seed(1)
+        outputs.append(update(batch.copy()))
+    assert_close(*outputs)
 
 
 @pytest.mark.slow

@@ -36,6 +36,8 @@ __all__ = [
 
 HIDDEN_SIZES = (256, 256)
 LOG_SCALE_BOUNDS = (-5.0, 2.0)
+NARROW = 32
+"""Matrices with no more rows or columns are multiplied fastest without further ado."""
 
 
 class DenseNetwork(TensorDictModuleBase):
@@ -96,8 +98,9 @@ class DenseNetwork(TensorDictModuleBase):
         in the losses that have several Q networks. On a CPU it is faster than either: parameters
         are not swapped in and out of the module, and nothing but the outputs is stacked.
 
-        An entry that ``expand`` has repeated along the first dimension, as states are that have
-        several actions each, is multiplied by the first layer once.
+        Where entries of more than 32 numbers are repeated along the first dimension by ``expand``,
+        beside others that are not, as states are that have several actions each, the first layer
+        multiplies them once.
 
         Args:
             tensordict: with the entries to read; left as it is.
@@ -124,9 +127,12 @@ class DenseNetwork(TensorDictModuleBase):
         return zip(self._names[::2], self._names[1::2], self.sizes, self.sizes[1:], strict=False)
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
-        """The inputs side by side; if only some are repeated, each by itself."""
+        """The inputs side by side; if some are repeated beside others that are not, each alone."""
         inputs = [tensordict.get(key) for key in self.in_keys]
-        if len(inputs) == 1 or len({_is_repeated(x) for x in inputs}) > 1:
+        if len(inputs) == 1:
+            return inputs
+        fit = len({(x.shape[:-1], x.dtype) for x in inputs}) == 1
+        if fit and len({_is_repeated(x) for x in inputs}) > 1:
             return inputs
         return [torch.cat(inputs, -1)]
 
@@ -150,7 +156,7 @@ def _first_layer(inputs: Sequence[Tensor], weight: Tensor, bias: Tensor) -> Tens
     """The product of a layer with inputs side by side, in rows; with what is repeated, once."""
     if len(inputs) == 1:
         return _product(_in_rows(inputs[0]), weight, bias)
-    shared, own = bias, list[Tensor]()
+    shared, own = bias, []
     for x, columns in zip(inputs, weight.split([x.shape[-1] for x in inputs], -1), strict=True):
         if _is_repeated(x):
             shared = shared + _product(_in_rows(x[0]), columns, None)
@@ -161,8 +167,18 @@ def _first_layer(inputs: Sequence[Tensor], weight: Tensor, bias: Tensor) -> Tens
 
 
 def _is_repeated(x: Tensor) -> bool:
-    """Whether ``expand`` has made it, the same all along its first dimension, of data."""
-    return x.dim() > 2 and x.shape[0] > 1 and x.stride(0) == 0 and not x.requires_grad
+    """Whether ``expand`` has made it, the same all along its first dimension, and it is worth it.
+
+    If it has a gradient, that is one of each copy.
+    """
+    return (
+        x.dim() > 2
+        and x.shape[0] > 1
+        and x.stride(0) == 0
+        and x.shape[-1] > NARROW
+        and not x.requires_grad
+        and not torch._C._are_functorch_transforms_active()
+    )
 
 
 def _in_rows(x: Tensor) -> Tensor:
@@ -171,7 +187,10 @@ def _in_rows(x: Tensor) -> Tensor:
 
 def _product(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
     """``torch.nn.functional.linear``, by oneDNN where it can be and is worth it."""
-    return _fast_linear(x, weight, bias) if _is_fast(x, weight) else linear(x, weight, bias)
+    if not _is_fast(x, weight):
+        return linear(x, weight, bias)
+    # In the backward pass x stands where the weight does.
+    return _fast_linear(_dense(x), _dense(weight), bias)
 
 
 class _OneDNNLinear(Function):
@@ -183,7 +202,6 @@ class _OneDNNLinear(Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-        x, weight = _dense(x), _dense(weight)  # in the backward pass x stands where the weight does
         ctx.save_for_backward(x, weight)
         return (_opaque if torch.compiler.is_compiling() else _onednn)(x, weight, bias)
 
@@ -217,20 +235,19 @@ _fast_linear: Callable[..., Tensor] = _OneDNNLinear.apply
 _HAS_ONEDNN = torch.backends.mkldnn.is_available() and hasattr(
     torch.ops.mkldnn, "_linear_pointwise"
 )
-NARROW = 32
 
 
 def _is_fast(x: Tensor, weight: Tensor) -> bool:
     """Whether :class:`_OneDNNLinear` can stand for ``linear``: on floats of a CPU, untransformed.
 
-    It takes longer for a few rows or outputs, as the last layer has them.
+    It takes longer for few rows, inputs or outputs, as the last layer has them.
     """
     return (
         _HAS_ONEDNN
         and torch.backends.mkldnn.enabled
         and x.dim() == 2
-        and min(x.shape[0], weight.shape[0]) > NARROW
-        and x.shape[1] > 0  # it refuses empty matrices
+        and min(*x.shape, weight.shape[0]) > NARROW
+        and x.shape[1] == weight.shape[1]  # if not, let `linear` say so
         and x.dtype == weight.dtype == torch.float32
         and x.device.type == "cpu"
         and not torch.is_autocast_enabled("cpu")

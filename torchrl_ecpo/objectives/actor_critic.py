@@ -296,6 +296,12 @@ class ActorCriticLoss(PolicyLoss):
             ``reduction="none"`` each has the shape of the batch.
         """
         transitions, mask = self._read(tensordict)
+        if self.num_actor_states is not None and not transitions.ndim:
+            raise ValueError(
+                f"num_actor_states={self.num_actor_states} takes the first of a batch, but this is "
+                "one transition, without a batch dimension: build the loss with "
+                "num_actor_states=None."
+            )
         target = self.soft_bellman_target(transitions)
         loss_qvalue, td_error = self._qvalue_loss(transitions, target)
         states: Any = transitions[: self.num_actor_states]
@@ -705,7 +711,7 @@ class ActorCriticLoss(PolicyLoss):
     ) -> Tensor:
         """What each of the N Q networks writes, ``[N, ...]``."""
         network, name = self.qvalue_network, self._qvalue_key
-        if hasattr(network, "each"):  # it knows a faster way, see DenseNetwork
+        if self._knows_each:
             return _written(network.each(inputs, params), name, key, network)
         if not self.deactivate_vmap:
             return _written(self._vmap_qvalue(inputs, params), name, key, network)
@@ -715,6 +721,11 @@ class ActorCriticLoss(PolicyLoss):
             with each.to_module(network, preserve_module_state=False):
                 outputs.append(_written(network(inputs.copy()), name, key, network))
         return torch.stack(outputs)
+
+    @property
+    def _knows_each(self) -> bool:
+        """Whether the Q network knows a faster way of its own (not what it wraps: DenseNetwork)."""
+        return hasattr(type(self.qvalue_network), "each")
 
     @property
     def _next_observations(self) -> list[NestedKey]:
@@ -848,7 +859,7 @@ class ContinuousActorCriticLoss(ActorCriticLoss):
         shape = action.shape[:-1]
         # Samples become more rows, not more steps, which a recurrent network would tell apart. What
         # has `each` keeps them apart from the states, which it need not read once for each sample.
-        rows = shape if hasattr(self.qvalue_network, "each") else (-1, *shape[2:])
+        rows = shape if self._knows_each else (-1, *shape[2:])
         inputs = observations.select(*self._qvalue_observations).expand(shape).reshape(rows)
         inputs.set(self.tensor_keys.action, action.reshape(*rows, action.shape[-1]))
         qvalues = self._each_qvalue(inputs, qvalue_params, self.tensor_keys.state_action_value)
