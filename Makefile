@@ -32,7 +32,7 @@ demo: install ## compare ECPO, UREX and MENT on the 10,000-armed bandit, then tr
 	@$(RUN) -m torchrl_ecpo.experiment.compare runs/demo/bandit --metric expected_reward \
 		--title "10,000-armed bandit" --x-label "sampled actions"
 
-study: install ## make the runs of the study that are not done; ARGS='--only figure1 --seeds 1-3'
+study: install ## make the runs of the study that are not in runs/study; ARGS='--missing', ARGS='--only figure1 --seeds 1-3'
 	$(RUN) sota-implementations/study/run.py $(ARGS)
 
 report: install ## write docs/study.md from committed results; RUNS=runs/study takes runs in first

@@ -49,6 +49,7 @@ Every run, figure and table here follows from
 ```bash
 make study                                      # the runs; goes on where it was stopped
 make study ARGS='--only figure1 --seeds 1-10 --stack 5'   # some of them, five in one process
+make study ARGS='--missing'                     # those that this page says are missing
 make report RUNS=runs/study                     # take their results in, and write this page
 make report                                     # write it from the committed results
 ```
