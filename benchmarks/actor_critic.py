@@ -159,7 +159,7 @@ def peer_loop() -> Iteration:
     try:
         from stable_baselines3 import SAC  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        message = "The peer is not installed: pip install 'torchrl-ecpo[bench]'."
+        message = "The peer is not installed: pip install '.[bench]' in the repository."
         raise ModuleNotFoundError(message) from error
 
     model = SAC("MlpPolicy", "HalfCheetah-v5", learning_starts=0, device="cpu", seed=0)
@@ -188,10 +188,11 @@ def main() -> None:
     add_csv_option(parser)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    peer = peer_loop()
     updates = {name: update(configure(overrides)) for name, overrides in UPDATES.items()}
     rows = compare("update", updates, arguments.repeats)
     loops = {name: script_loop(configure(overrides)) for name, overrides in LOOPS.items()}
-    loops = {"Stable-Baselines3 SAC": peer_loop(), **loops}
+    loops = {"Stable-Baselines3 SAC": peer, **loops}
     rows += compare("loop", loops, arguments.repeats)
     print("what    method                   ms a step  time ratio  speed ratio")
     for row in rows:

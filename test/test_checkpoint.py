@@ -6,6 +6,7 @@ import csv
 import importlib
 import io
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -16,6 +17,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 from torchrl.checkpoint import Checkpoint, CheckpointError
 from torchrl.envs import DMControlEnv, GymEnv, TransformedEnv
 
@@ -220,8 +223,30 @@ def test_a_new_run_in_an_old_directory_forgets_the_old_one(interrupted, start):
     assert_same_run(interrupted, interrupted / "whole")
 
 
+def test_a_new_run_that_is_killed_at_once_can_be_begun_again(interrupted, start, capfd):
+    with pytest.raises(Killed):
+        start(interrupted, *RUNS["bandit"], "seed=8", kill_at=1)
+    assert not (interrupted / "checkpoints").exists()
+    start(interrupted, *RUNS["bandit"], "seed=8", "resume=auto")
+    assert "resume=auto found no checkpoint: a new run begins" in capfd.readouterr().out
+    start(interrupted / "whole", *RUNS["bandit"], "seed=8")
+    assert_same_run(interrupted, interrupted / "whole")
+
+
+@pytest.mark.parametrize(
+    "name", ["plain_1", "env-a,loss-b", "it's (a) run", r"back\slash", r"end\'"]
+)
+def test_the_command_that_resumes_is_one_that_hydra_reads(tmp_path, name):
+    config = {"resume": None, "checkpoint": {"interval": 1, "keep": 1, "max_share": 0.1}}
+    command = Checkpoints(OmegaConf.create(config), tmp_path / name).command
+    override = shlex.split(command)[-1]
+    (parsed,) = OverridesParser.create().parse_overrides([override])
+    assert parsed.value() == str(tmp_path / name)
+    assert not parsed.is_sweep_override()
+
+
 def test_a_finished_run_stays_as_it_is(tmp_path, start, capfd):
-    run = (*RUNS["pendulum"], "total_frames=88")
+    run = (*RUNS["pendulum"], "total_frames=120")
     start(tmp_path, *run)
     rows, (path,) = record(tmp_path), checkpoints(tmp_path)
     assert "replay_buffer" not in Checkpoint.manifest(path)["components"]

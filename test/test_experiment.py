@@ -168,6 +168,16 @@ def test_compare_prints_a_table_and_writes_picture_and_curves(runs, capsys):
     assert lines[-1] == "urex,0,30,2"
 
 
+def test_methods_are_told_apart_by_what_is_null_too(runs):
+    for name, target in (("fixed", None), ("learned", 0.1)):
+        loss = {"name": "ecac", "target_kl": target}
+        with make_run(runs / name, make_config(loss=loss)) as run:
+            run.log({"return": 1.0}, step=10)
+    found = find_runs([runs / "fixed", runs / "learned"])
+    comparison = load_comparison(found, "return", by=["loss.name", "loss.target_kl"])
+    assert set(comparison.curves) == {"ecac, loss.target_kl null", "ecac, loss.target_kl 0.1"}
+
+
 def test_comparison_refuses_runs_that_cannot_be_compared(runs):
     with make_run(runs / "ecpo/2", make_config(loss={"name": "ecpo", "tau": 0.1})) as run:
         run.log({"return": 1.0}, step=1000)

@@ -69,12 +69,20 @@ LONGEST_EPISODE = 100_000
 
 def check_config(config: DictConfig) -> None:
     """Refuse settings with which a run would never end, or break late."""
-    counts = ("total_frames", "log_interval", "updates_per_frame", "collector.frames_per_batch")
-    check_options(config, (*counts, "evaluation.interval", "evaluation.episodes"))
+    counts = ["total_frames", "log_interval", "updates_per_frame", "collector.frames_per_batch"]
+    counts += ["evaluation.interval", "evaluation.episodes", "loss.policy_delay"]
+    if "reference_interval" in config.loss:
+        counts.append("loss.reference_interval")
+    check_options(config, counts)
     if config.evaluation.interval % config.log_interval:
         raise ValueError(
             "evaluation.interval must be a multiple of log_interval, got "
             f"{config.evaluation.interval} and {config.log_interval}."
+        )
+    if config.total_frames % config.log_interval:
+        raise ValueError(
+            "total_frames must be a multiple of log_interval, or the last frames would not be "
+            f"logged, got {config.total_frames} and {config.log_interval}."
         )
     if config.replay_buffer.storage not in ("tensor", "memmap"):
         raise ValueError(

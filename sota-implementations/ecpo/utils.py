@@ -135,7 +135,10 @@ def reached(goal: DictConfig | None, metrics: Metrics) -> bool | torch.Tensor:
     if goal is None:
         return True
     if goal.metric not in metrics:
-        raise KeyError(f"anneal_from.metric must be one of {sorted(metrics)}, got {goal.metric!r}.")
+        raise KeyError(
+            f"anneal_from.metric must be one of {sorted(metrics)}, which every gradient step has, "
+            f"got {goal.metric!r}."
+        )
     is_reached = torch.as_tensor(metrics[goal.metric] >= goal.at_least)
     return is_reached if is_reached.ndim else bool(is_reached)
 

@@ -62,21 +62,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     names = dict.fromkeys(cell.study for cell in cells)
     results = {name: Results.read(options.results / "study" / name) for name in names}
     added, others = dict.fromkeys(names, 0), 0
+    unread = 0
     for record in records:
-        matching = [cell for cell in cells if is_of(cell, record, options.ignore)]
-        for cell in matching:
-            metrics = [cell.task.metric, *manifest.studies[cell.study].also]
-            added[cell.study] += results[cell.study].add(cell, record, metrics, options.ignore)
-        if not matching:
-            others += 1
-            if options.unmatched:
-                print(f"{record.path}: {nearest(record, cells)}")
+        try:
+            matching = [cell for cell in cells if is_of(cell, record, options.ignore)]
+            for cell in matching:
+                metrics = [cell.task.metric, *manifest.studies[cell.study].also]
+                added[cell.study] += results[cell.study].add(cell, record, metrics, options.ignore)
+            if not matching:
+                others += 1
+                if options.unmatched:
+                    print(f"{record.path}: {nearest(record, cells)}")
+        except Exception as error:  # whatever a torn or a strange file raises: the others count
+            print(f"{record.path} is left out: {type(error).__name__}: {error}")
+            unread += 1
     for name, result in results.items():
         if result.runs:
             result.write()
             print(f"{name}: {added[name]} runs taken in, {len(result.runs)} in all")
     print(f"{others} of {len(records)} runs are in no cell{' (--unmatched)' if others else ''}")
-    return 0
+    return int(unread > 0)
 
 
 if __name__ == "__main__":

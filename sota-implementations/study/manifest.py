@@ -139,7 +139,10 @@ def _compose(script: Path, options: tuple[str, ...]) -> DictConfig:
 
 def total_option(config: DictConfig) -> str:
     """The option that says how long a run is; its unit follows ``total_``."""
-    return next(str(name) for name in config if str(name).startswith("total_"))
+    for name in map(str, config):
+        if name.startswith("total_"):
+            return name
+    raise ValueError("It is no configuration of one of the scripts: it has no total_ entry.")
 
 
 def identity(config: DictConfig) -> dict[str, float | str]:
@@ -264,6 +267,8 @@ def parse_seeds(given: str | int | Sequence[int]) -> tuple[int, ...]:
         if bounds is None:
             raise ValueError(f"Seeds are written like 1-3,7 or [1, 2, 3, 7], got {given!r}.")
         first, last = int(bounds[1]), int(bounds[2] or bounds[1])
+        if last < first:
+            raise ValueError(f"Seeds are counted upwards, got {part!r}.")
         seeds += range(first, last + 1)
     if not seeds or len(set(seeds)) < len(seeds):
         raise ValueError(f"Seeds must be there, and none twice, got {given!r}.")
@@ -306,6 +311,9 @@ def _read_task(where: str, name: str, entry: object) -> Task:
 
 def _read_study(where: str, name: str, entry: object, tasks: Mapping[str, Task]) -> Study:
     study = _read(Study, where, name, entry)
+    for field in ("tasks", "also"):
+        if isinstance(getattr(study, field), str):
+            raise ValueError(f"{where}: {field} must be a list, got {getattr(study, field)!r}.")
     try:
         study = dataclasses.replace(
             study,
@@ -328,6 +336,10 @@ def _read_study(where: str, name: str, entry: object, tasks: Mapping[str, Task])
             raise ValueError(
                 f"{where}: method {method} must be options of the script, or a mapping with "
                 f"options and grid, got {plan!r}."
+            )
+        if study.kind == "curves" and not isinstance(plan, str):
+            raise ValueError(
+                f"{where}: method {method} has a grid, which needs kind: ranking or heat_map."
             )
         if study.kind == "heat_map" and (isinstance(plan, str) or len(plan["grid"]) != 2):
             raise ValueError(f"{where}: a heat map needs a grid of two axes, method {method}.")

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from manifest import SCRIPTS, Cell, Manifest, Study, argument_parser, read_manifests
-from results import RESULTS, Point, Results
+from results import RESULTS, Point, Results, recorded
 from scores import (
     Estimate,
     area,
@@ -144,11 +144,12 @@ def read_cell(cell: Cell, results: Results) -> CellResult:
         run = results.runs.get(key)
         if run is None or run["options"] != options:
             continue
-        if int(run["reached"]) < cell.steps:
+        if recorded(run) < cell.steps:
             unfinished += 1
             continue
         complete[seed] = run
-        curves[seed] = [point for point in results.curves[key] if point["step"] <= cell.steps]
+        points = results.curves.get(key, [])  # none, if nothing was ever measured
+        curves[seed] = [point for point in points if point["step"] <= cell.steps]
     return CellResult(cell, complete, unfinished, curves)
 
 
@@ -265,10 +266,14 @@ def aggregates(study: Study, cells: Sequence[CellResult]) -> str:
     }
     if None in units.values():
         return ""
+    # One below 0 would turn the order round.
+    units = {name: unit for name, unit in units.items() if unit > 0}
+    if not units:
+        return ""
     by_method = {}
     for method in study.methods:
         # As many runs of a method on each task as where it has fewest, the first seeds.
-        count = min(len(finals[name, method]) for name in tasks)
+        count = min(len(finals[name, method]) for name in units)
         columns = [finals[name, method][:count] / unit for name, unit in units.items()]
         by_method[method] = np.stack(columns, axis=1)
     means, first = interquartile_means(by_method), next(iter(study.methods))
@@ -278,7 +283,7 @@ def aggregates(study: Study, cells: Sequence[CellResult]) -> str:
         for m in study.methods
     ]
     unit = f"the mean of {study.scale_by}" if study.scale_by else "the score of a perfect policy"
-    titles = ", ".join(r.title for r in tasks.values())
+    titles = ", ".join(tasks[name].title for name in units)
     header = ("method", "runs a task", "IQM", f"probability that {first} is better")
     return (
         f"Final scores over {titles}, each in units of {unit}; of a method that has more runs on "
@@ -378,7 +383,7 @@ def heat_maps(study: Study, cells: Sequence[CellResult], docs: Path) -> str:
         heat_map(study, group, docs, metric)
         for group in groups_of(cells)
         for metric in (group[0].cell.task.metric, *study.also)
-        if any(result.runs for result in group)
+        if any(result.curve(metric) is not None for result in group)
     )
 
 

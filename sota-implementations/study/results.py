@@ -77,7 +77,7 @@ class Results:
             )
             self._drop(cell)
         key = (cell.task.name, cell.method, cell.label, record.seed)
-        if key in self.runs and int(self.runs[key]["reached"]) >= record.reached:
+        if key in self.runs and recorded(self.runs[key]) >= min(record.reached, cell.steps):
             return False
         self.configs[cell.name] = config
         self.curves[key] = thin(record.metrics, metrics, cell.steps)
@@ -97,7 +97,7 @@ class Results:
     def has(self, cell: Cell, seed: int, ignored: Sequence[str] = ()) -> bool:
         """Whether a run of the cell as it is now is there, with all its steps."""
         run = self.runs.get((cell.task.name, cell.method, cell.label, seed))
-        if run is None or int(run["reached"]) < cell.steps:
+        if run is None or recorded(run) < cell.steps:
             return False
         config = _but_for_the_seed(cell.identity(seed))
         return not changed_entries(self.configs[cell.name], config, ignored)
@@ -107,6 +107,11 @@ class Results:
             if key[:3] == (cell.task.name, cell.method, cell.label):
                 del self.runs[key]
                 self.curves.pop(key, None)  # none, of a run that was killed before its first point
+
+
+def recorded(run: Mapping[str, str]) -> int:
+    """Up to which step the curve of a run goes: no further than its cell did when it was taken."""
+    return min(int(run["reached"]), int(run["steps"]))
 
 
 def thin(columns: Mapping[str, Sequence[float]], metrics: Sequence[str], steps: int) -> list[Point]:
@@ -121,7 +126,7 @@ def thin(columns: Mapping[str, Sequence[float]], metrics: Sequence[str], steps: 
         >>> thin({"step": [1, 2, 3], "return": [0.0, 2.0, 5.0]}, ["return"], steps=200)
         [{'step': 2, 'return': 1.0}, {'step': 4, 'return': 5.0}]
     """
-    at = np.array(columns["step"])
+    at = np.array(columns.get("step", ()))
     width = steps / POINTS
     # Rounding errors must not put the last step of a part into the next.
     parts = np.maximum(np.ceil(at / width - 1e-9), 1)

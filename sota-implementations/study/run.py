@@ -123,9 +123,9 @@ def planned_runs(
         for seeds in partition(list(by_seed), begun(base), size):
             longest = max((by_seed[s] for s in seeds if s in by_seed), key=lambda cell: cell.steps)
             kind = "seed" if len(seeds) == 1 else "seeds"
-            runs.append(Run(longest, seeds, base / "_".join([kind, *map(str, seeds)]), ignored))
-    places = {seed: place for cell in cells for place, seed in enumerate(cell.seeds)}
-    return sorted(runs, key=lambda run: min(places[s] for s in run.seeds if s in places))
+            run = Run(longest, seeds, base / "_".join([kind, *map(str, seeds)]), ignored)
+            runs.append((min(list(by_seed).index(s) for s in seeds if s in by_seed), run))
+    return [run for _, run in sorted(runs, key=lambda pair: pair[0])]
 
 
 def without_results(

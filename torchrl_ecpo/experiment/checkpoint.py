@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import shutil
 import signal
@@ -13,6 +14,7 @@ from types import FrameType, SimpleNamespace, TracebackType
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.utils import to_absolute_path
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
@@ -86,7 +88,6 @@ class Checkpoints:
         self.source = None if config.resume is None else self._find()
         self._stopped_by: signal.Signals | None = None
         self._handlers: dict[signal.Signals, Any] = {}
-        self._is_first = True
 
     def _find(self) -> Path | None:
         """The checkpoint to resume from."""
@@ -138,7 +139,10 @@ class Checkpoints:
                 # One file each. It is read without unpickling anything but tensors and numbers.
                 adapter = StateDictCheckpointAdapter("torch")
                 self.checkpoint.register(name, part, adapter=adapter)
-        if self.source is not None:
+        if self.source is None:
+            # Those of a run that was here before; its record is gone.
+            shutil.rmtree(self.rotation.directory, ignore_errors=True)
+        else:
             self._load(self.source)
         self._saved_step = self.step if self.source is not None else None
         self._saved_at, self._pause = time.monotonic(), 0.0
@@ -199,8 +203,8 @@ class Checkpoints:
         started = time.monotonic()
         names = set(self.checkpoint.components) - (ONLY_TO_GO_ON if finished else set())
         try:
-            if self._is_first:
-                self._clear()
+            for remains in self.rotation.directory.glob(f".{self.rotation.prefix}-*"):
+                shutil.rmtree(remains, ignore_errors=True)  # of a write that was killed
             self.rotation.save(
                 self.checkpoint,
                 step=self.step,
@@ -216,14 +220,6 @@ class Checkpoints:
             CheckpointRotation(self.rotation.directory, keep_last=1).prune()
         self._saved_step, self._saved_at = self.step, time.monotonic()
         self._pause = (self._saved_at - started) / self.options.max_share
-
-    def _clear(self) -> None:
-        """Remove what a killed write left; and of a run begun anew in its directory, the old."""
-        self._is_first = False
-        if self.source is None:
-            shutil.rmtree(self.rotation.directory, ignore_errors=True)
-        for remains in self.rotation.directory.glob(f".{self.rotation.prefix}-*"):
-            shutil.rmtree(remains, ignore_errors=True)
 
     def _check_parameters(self) -> None:
         for part, module in self.parts.items():
@@ -241,7 +237,10 @@ class Checkpoints:
         if HydraConfig.initialized():
             overrides = list(HydraConfig.get().overrides.task)
         kept = [option for option in overrides if not option.lstrip("+").startswith("resume=")]
-        return shlex.join(["python", sys.argv[0], *kept, f"resume={self.directory}"])
+        directory = str(self.directory)
+        if not re.fullmatch(r"[\w./-]+", directory):  # hydra has a meaning for commas, for one
+            directory = QuotedString(directory, Quote.single).with_quotes()
+        return shlex.join(["python", sys.argv[0], *kept, f"resume={directory}"])
 
     def __enter__(self) -> Checkpoints:
         """Take over SIGTERM and SIGINT."""
@@ -325,5 +324,10 @@ def _differences(saved: dict[str, Any], present: dict[str, Any]) -> list[str]:
     return [
         words
         for name, words in differences(old, new).items()
-        if not (name.startswith("total_") and float(old[name]) < float(new[name]))
+        if not (
+            name.startswith("total_")
+            and name in old
+            and name in new
+            and float(old[name]) < float(new[name])
+        )
     ]

@@ -116,11 +116,12 @@ def load_comparison(
 
 def _method(run: Path, by: Sequence[str]) -> str:
     config = OmegaConf.load(run / "config.yaml")
-    values = [OmegaConf.select(config, entry) for entry in by]
-    if None in values:
-        missing = by[values.index(None)]
+    absent = object()
+    values = [OmegaConf.select(config, entry, default=absent) for entry in by]
+    if absent in values:
+        missing = by[values.index(absent)]
         raise KeyError(f"The config.yaml of {run} has no entry {missing!r} to tell methods apart.")
-    first, *others = map(str, values)
+    first, *others = ("null" if value is None else str(value) for value in values)
     return ", ".join([first, *(f"{e} {v}" for e, v in zip(by[1:], others, strict=True))])
 
 

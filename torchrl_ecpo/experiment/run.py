@@ -194,7 +194,9 @@ class Run:
         self.stack_size = stack_size
         self.step = 0
         self._latest: dict[str, float] = {}
-        OmegaConf.save(config, self.directory / "config.yaml", resolve=True)
+        # At once, as others read it while runs go on.
+        OmegaConf.save(config, self.directory / "config.yaml.part", resolve=True)
+        os.replace(self.directory / "config.yaml.part", self.directory / "config.yaml")
         _write_json(self.directory / "versions.json", _versions())
         self.table = MetricsTable(None if backend == "none" else self.directory / METRICS_FILE)
         self._logger = self._make_logger(config, backend)
