@@ -16,10 +16,18 @@ from torch.testing import assert_close
 from torchrl.data import (
     Composite,
     LazyTensorStorage,
+    NonTensor,
     TensorDictReplayBuffer,
     Unbounded,
 )
-from torchrl.envs import EnvBase, InitTracker, RewardSum, StepCounter, TransformedEnv
+from torchrl.envs import (
+    EnvBase,
+    InitTracker,
+    RenameTransform,
+    RewardSum,
+    StepCounter,
+    TransformedEnv,
+)
 from torchrl.modules import LSTMModule, RandomPolicy, get_env_transforms_from_module
 
 from torchrl_ecpo.collectors import TrajectoryGroupCollector, shut_down
@@ -251,6 +259,40 @@ def test_what_a_batch_keeps():
     full = {("next", key) for key in ("observation", "group", "is_init")}
     keys = [set(batch.keys(True, True)) for batch in batches]
     assert keys == [shared | outcome | {"features"}, shared | outcome | full]
+
+
+def nested_policy(read):
+    """What it reads, and all it writes but the action, is nested in `agents` and `params`."""
+    network = nn.Linear(2, 1)
+
+    def act(entries):
+        features = entries["features"] if read == "agents" else entries
+        action = network(features).detach().abs() + 1
+        return action, action.clone()
+
+    return TensorDictModule(act, [read], ["action", ("params", "loc")])
+
+
+@pytest.mark.parametrize("read", ["agents", ("agents", "features")], ids=str)
+def test_nested_entries_are_read_and_left_out_by_what_they_are_nested_in(read):
+    env = TransformedEnv(Countdown(), RenameTransform(["observation"], [("agents", "features")]))
+    options = {"num_groups": 2, "group_size": 3, "exclude_keys": ["params"]}
+    batch = next(iter(TrajectoryGroupCollector(env, nested_policy(read), **options)))
+    assert ("agents", "features") in batch.keys(True)
+    assert not any("params" in key for key in batch.keys(True, True))
+    options["exclude_keys"] = ["agents"]
+    batch = next(iter(TrajectoryGroupCollector(env, nested_policy(read), **options)))
+    assert ("params", "loc") in batch.keys(True)
+    assert not any("agents" in key for key in batch.keys(True, True))
+
+
+def test_entries_that_are_no_tensors_are_refused():
+    env = Countdown()
+    spec = env.observation_spec.clone()
+    spec["prompt"] = NonTensor(shape=env.batch_size)
+    env.observation_spec = spec
+    with pytest.raises(TypeError, match=r"Only tensors .*'prompt'.*ExcludeTransform"):
+        TrajectoryGroupCollector(env, linear_policy(1.0), num_groups=2, group_size=3)
 
 
 def test_a_batch_is_sampled_from_the_reference():

@@ -185,6 +185,11 @@ class TestPack:
         mixed["group"][0, 0, 1] = 4
         with pytest.raises(ValueError, match="1 trajectories change their group"):
             pack_groups(mixed.reshape(6, 4))
+        cut = groups.clone()
+        cut["next", "done"][1, 0] = False
+        for data in (cut, cut.reshape(6, -1)):
+            with pytest.raises(ValueError, match=r"1 trajectories have no end .*'done'"):
+                pack_groups(data)
         several = make_steps(TRAJECTORIES).reshape(2, 6)
         with pytest.raises(ValueError, match=r"several trajectories.*flat"):
             pack_groups(several)
@@ -214,7 +219,9 @@ class TestSampler:
             assert (group[:, 0] == group[:, 1]).all()
             assert group[0, 0] != group[1, 0]
             assert (sample["x"][..., 0].unique().numel()) == 4
-            assert_close(pack_groups(sample, group_size=2), sample)
+            assert pack_groups(sample, group_size=2) is sample
+            repacked = pack_groups(unpack_groups(sample), group_size=2)
+            assert_close(unpack_groups(repacked), unpack_groups(sample))
             seen.update(group.flatten().tolist())
         assert seen == {5, 2, 9}  # 7 waits
         buffer.extend(make_steps([(7, 1)], first_id=50))
@@ -335,6 +342,26 @@ class TestSampler:
         buffer.extend(make_steps([(3, 1)], first_id=10))
         assert sorted(buffer.sampler._members) == [3, 8]
         assert buffer.sampler._length[5] == 3
+
+    def test_an_edit_named_in_any_order_makes_no_trajectories(self, storage):
+        buffer = make_buffer(10, storage=storage, batch_size=2)
+        buffer.extend(make_steps([(1, 4), (1, 4)]))
+        buffer.extend(make_steps([(1, 4)], first_id=2))  # round the end, over the first one
+        sampler = buffer.sampler
+        expected = {4: 4, 8: 4}
+
+        def lengths():
+            starts = [start for pool in sampler._members.values() for start in pool.items]
+            assert len(starts) == len(set(starts))
+            return {start: int(sampler._length[start]) for start in starts}
+
+        assert lengths() == expected
+        for index in (torch.arange(10), torch.arange(9, -1, -1), buffer.sample()["index"]):
+            buffer.mark_update(index)
+            assert lengths() == expected
+        buffer[4:8] = buffer[4:8].clone().set("group", torch.full((4,), 8))
+        buffer.mark_update(torch.tensor([5]))
+        assert sorted(sampler._members) == [1, 8]
 
     def test_a_trajectory_that_overwrites_its_own_beginning(self, storage):
         """Whatever the fragments and the storage: a trajectory is drawn whole or not at all."""

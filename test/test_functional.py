@@ -650,6 +650,20 @@ def test_a_group_without_a_real_sample_has_no_loss_and_no_gradient(name):
     assert effective_sample_size(per_sample[0])[1] == 0
 
 
+def test_a_state_without_a_real_sample_leaves_the_gaussian_as_it_is():
+    loc, scale = (torch.full((2, 3), value, requires_grad=True) for value in (2.0, 0.5))
+    mask = torch.tensor([[True] * 4, [False] * 4])
+    samples = torch.randn(2, 4, 3)
+    loss, weights = centred_gaussian_projection(loc, scale, samples, torch.randn(2, 4), mask=mask)
+    assert loss[1] == 0
+    assert (weights[1] == 0).all()
+    loss.sum().backward()
+    for parameter in (loc, scale):
+        assert parameter.grad is not None
+        assert (parameter.grad[1] == 0).all()
+        assert (parameter.grad[0] != 0).all()
+
+
 @every_function
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("shape", [(), (2,), (2, 3), (2, 1, 3)], ids=str)

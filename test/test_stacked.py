@@ -18,8 +18,14 @@ from torchrl.envs import InitTracker, TransformedEnv
 
 from torchrl_ecpo.envs import AlgorithmicEnv, BanditEnv, stack_envs
 from torchrl_ecpo.experiment import Checkpoints, Run, read_metrics
-from torchrl_ecpo.modules import make_softmax_policy, make_tuple_policy, stack_policies
+from torchrl_ecpo.modules import (
+    TupleCategorical,
+    make_softmax_policy,
+    make_tuple_policy,
+    stack_policies,
+)
 from torchrl_ecpo.modules.histories import distinct_histories
+from torchrl_ecpo.modules.stacked import _RandomStreams
 
 SCRIPT = Path(__file__).parents[1] / "sota-implementations/ecpo"
 MODULES = ("utils", "tasks", "stack", "ecpo")
@@ -193,6 +199,19 @@ def test_a_run_samples_and_steps_as_alone():
             for own, part, rows in zip(alone, parts, reset.split(2), strict=True)
         ]
         assert whole["observation"].equal(torch.cat([part["observation"] for part in parts]))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.float16])
+def test_a_run_draws_as_alone(dtype):
+    logits, states = torch.zeros(5, 7, dtype=dtype), []
+    alone = []
+    for seed, rows in ((3, 2), (4, 3)):
+        torch.manual_seed(seed)
+        states.append(torch.get_rng_state())
+        own = TupleCategorical(logits[:rows], (2, 2, 3))
+        alone.append(own.sample())
+    uniform = _RandomStreams(states).uniform([2, 3], logits)
+    assert TupleCategorical(logits, (2, 2, 3)).choose(uniform).equal(torch.cat(alone))
 
 
 def test_policies_see_their_part_of_the_stacked_parameters():

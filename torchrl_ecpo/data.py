@@ -92,6 +92,7 @@ def pack_groups(
         if mask is None:
             mask = _mask_from_done(data, done_key, traj_key)
         _check_padded(mask, group, data.shape)
+        _check_ends(data, mask, done_key)
         if data.ndim > 2:
             _check_groups(group, mask, data.shape[-2], group_size)
             return data if mask_key in data.keys(True) else data.copy().set(mask_key, mask)
@@ -202,6 +203,19 @@ def _check_padded(mask: Tensor, group: Tensor, shape: torch.Size) -> None:
         raise ValueError(
             f"{int(mixed.sum())} trajectories change their group on the way, the first one from "
             f"group {int(group[mixed][0, 0])}."
+        )
+
+
+def _check_ends(data: TensorDictBase, mask: Tensor, done_key: NestedKey) -> None:
+    """Refuse rows that were cut, as at the end of a batch: their return is not all of it."""
+    done = _per_step(data, done_key)
+    if done is None:
+        return
+    last = (mask.sum(-1, keepdim=True) - 1).clamp_min(0)
+    endless = ~done.gather(-1, last)
+    if endless.any():
+        raise ValueError(
+            f"{int(endless.sum())} trajectories have no end ({done_key!r} at their last real step)."
         )
 
 
@@ -365,8 +379,8 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
     The index follows every write of this process, at a cost proportional to what is written, and
     catches up with the writes of other processes at the next draw; a draw costs the same whatever
     the size of the storage. It takes 24 bytes for each slot of the storage. After an edit in place
-    of group, trajectory or done entries, call ``buffer.mark_update(index)`` with all steps of the
-    edited trajectories.
+    of group, trajectory or done entries, call ``buffer.mark_update(index)`` with at least one step
+    of each edited trajectory. One that was not whole before stays so.
 
     Args:
         group_size: `K`, the number of trajectories drawn from a group, at least 2.
@@ -461,7 +475,12 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
         tail = self._tail
         if written == self._seen:  # an edit in place: whatever is being written goes on after it
             self._tail = None
-        self._index(storage, index)
+            # The trajectories that it concerns, whole and in order. What was none stays none.
+            edited = self._owner[index].unique()
+            edited = edited[edited >= 0]
+            index, _ = self._slots(edited, self._length[edited])
+        if index.numel():
+            self._index(storage, index)
         if written == self._seen:
             self._tail = tail
         self._seen = written

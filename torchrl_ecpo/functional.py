@@ -28,6 +28,7 @@ mask                                  True where a sample is real; absent means 
 Temperatures are floats or 0-d tensors, in the unit of the score. Floats are checked; tensors are
 taken as they are, so that nothing waits for a device. Finite input never gives NaN, as long as the
 temperatures are neither 0 nor infinite in the dtype of the scores (from 1e-37 to 1e38 in float32).
+Half precision is too narrow for sums over trajectories: give float32, as the losses do.
 A group in which all samples are masked has weights and a loss of 0, and no soft value.
 """
 
@@ -368,7 +369,10 @@ def centred_gaussian_projection(
     distance = (mean - loc) / scale.detach()
     width = variance * (-2 * log_scale).exp()
     loss = log_scale + 0.5 * (width + distance.square() + math.log(2 * math.pi))
-    return Surrogate(loss.sum(-1), weights)
+    loss = loss.sum(-1)
+    if mask is not None:
+        loss = loss.where(mask.any(dim), 0.0)
+    return Surrogate(loss, weights)
 
 
 def mode_seeking_projection(

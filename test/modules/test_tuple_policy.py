@@ -85,6 +85,17 @@ class TestTupleCategorical:
         # Five standard deviations of a binomial.
         assert ((counts - expected).abs() <= 5 * expected.sqrt() + 1).all()
 
+    def test_what_is_improbable_is_rare_in_half_precision(
+        self, head: str, dtype: torch.dtype
+    ) -> None:
+        half = {torch.float32: torch.float16, torch.float64: torch.bfloat16}[dtype]
+        logits = torch.full((TupleCategorical.num_logits(NVEC, head),), -20.0)
+        logits[0] = 0.0
+        torch.manual_seed(0)
+        dist = TupleCategorical(logits.to(half), NVEC, head)
+        moves = dist.sample((100_000,))[..., 0]
+        assert (moves == dist.mode[..., 0]).all()  # the others: 2e-9 each
+
     def test_extreme_logits(self, head: str, dtype: torch.dtype) -> None:
         size = TupleCategorical.num_logits(NVEC, head)
         largest = torch.finfo(dtype).max
@@ -177,6 +188,9 @@ def test_state_hashes(dtype: torch.dtype, hidden: int) -> None:
     assert (hash_states(h.nextafter(h + 1), c) != hashes).all()
     assert (hash_states(-h, c) != hashes).all()
     assert (hash_states(c, h) != hashes).all()
+    # A row of a wider tensor is contiguous, wherever it begins.
+    packed = torch.cat([torch.zeros(1, 1, dtype=dtype), h[:1]], 1)
+    assert_close(hash_states(packed[:, 1:], c[:1]), hashes[:1])
 
 
 @pytest.mark.parametrize("seed", range(10))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 import torch
 from tensordict import TensorDict, lazy_stack
@@ -218,6 +220,19 @@ def test_parts_of_an_action_must_all_be_named(case):
     loss.set_keys(action="move", sample_log_prob=keys["sample_log_prob"])
     with pytest.raises(ValueError, match=r"draws the parts.*'move', 'write'.*set_keys"):
         loss(sample(actor, 2, 3, 4))
+
+
+@lifting
+@pytest.mark.parametrize("missing", [0, 1])
+def test_parts_of_the_log_probability_must_all_be_there(case, missing):
+    """One that is not there does not mean that none was recorded."""
+    actor = make_actor("composite")
+    loss = case.build(actor, delay_actor=True)
+    loss.set_keys(**ACTOR_KEYS["composite"])
+    PeriodicCopy(loss, "actor_network", interval=1)
+    key = ACTOR_KEYS["composite"]["sample_log_prob"][missing]
+    with pytest.raises(KeyError, match=re.escape(repr(key))):
+        loss(sample(actor, 2, 3, 4).exclude(key))
 
 
 @losses
@@ -490,6 +505,10 @@ def test_diagnostics_carry_no_gradient_and_no_loss_name(case):
         out = case.build(actor, reduction=reduction)(sample(actor, 2, 3, 4))
         assert [name for name, _ in out.items() if name.startswith("loss")] == ["loss_actor"]
         assert [name for name, value in out.items() if value.requires_grad] == ["loss_actor"]
+    batch = sample(actor, 2, 3, 4)
+    batch["next", "reward"].requires_grad_()
+    out = case.build(actor)(batch)
+    assert [name for name, value in out.items() if value.requires_grad] == ["loss_actor"]
 
 
 @losses

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Callable, Collection, Iterator, Sequence, Set
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torchrl.collectors import Collector, MultiCollector
 from torchrl.collectors.distributed import RayCollector
 from torchrl.collectors.utils import _maybe_normalize_replay_buffer_tensordict_device
+from torchrl.data import NonTensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import RandomPolicy
@@ -140,8 +141,8 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
         total_frames: stop when this many real steps have been collected. Default: -1, never.
         compact_obs: whether to leave observations out of ``"next"``: they are those of the next
             step. Default: True. A critic that needs the last one wants False.
-        exclude_keys: more entries to leave out, such as logits and features that a loss computes
-            anew.
+        exclude_keys: more entries to leave out, with what is nested in them, such as logits and
+            features that a loss computes anew.
         max_steps: the length at which a trajectory is taken to be endless. Default: 10,000.
         group_key: the environment's key of the problem instance.
         kwargs: everything else that ``Collector`` takes, such as `policy_factory`, devices,
@@ -149,7 +150,8 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
             `compile_policy`.
 
     Raises:
-        TypeError: for an argument that does not go with groups.
+        TypeError: for an argument that does not go with groups, and for an environment that writes
+            anything but tensors.
         ValueError: if `K` is below 2 or not the environment's, if `G` is no multiple, or if the
             environment makes groups of another size.
         KeyError: if the environment has no `group_key`.
@@ -236,6 +238,14 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
             )
         if "done" not in env.done_keys:
             raise KeyError(f"The environment must have one 'done' a row, it has {env.done_keys}.")
+        specs = env.full_observation_spec.items(True, True)
+        texts = [key for key, spec in specs if isinstance(spec, NonTensor)]
+        if texts:
+            raise TypeError(
+                f"Only tensors are collected, but the environment writes {texts}. Leave them out "
+                "with TorchRL's ExcludeTransform, or sample by a loop of your own: pack_groups "
+                "keeps them."
+            )
 
     def _maybe_setup_policy_env_transforms(self, env: EnvBase, policy: Any) -> EnvBase:
         """Append what the policy needs, an `InitTracker` and its primers, for resets alone.
@@ -419,7 +429,9 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
         carried = {unravel_key(key[1:]): key for key in written if key[0] == "next"}
         dropped = self.exclude_keys | carried.keys()
         written -= set(carried.values()) | (given - set(self._written))
-        read = given | written if self._read is None else set(self._read)
+        read = given | written
+        if self._read is not None:
+            read = {key for key in read if _is_below(key, self._read)}
         carried |= {key: key for key in (written & read) - result - carried.keys()}
         recorded = step.copy().update(acted.select(*written))
         kept = _recorded_keys(recorded, dropped, self.compact_obs)
@@ -471,12 +483,19 @@ def _recorded_keys(
         path = key if isinstance(key, tuple) else (key,)
         is_next = path[0] == "next"
         entry = unravel_key(path[1:] if is_next else path)
-        if not dropped.isdisjoint((key, entry)) or any(part.startswith("_") for part in path):
+        is_dropped = _is_below(key, dropped) or _is_below(entry, dropped)
+        if is_dropped or any(part.startswith("_") for part in path):
             continue
         if is_next and compact_obs and entry in present and path[-1] not in _DONE_NAMES:
             continue
         kept.append(key)
     return kept
+
+
+def _is_below(key: NestedKey, entries: Collection[NestedKey]) -> bool:
+    """Whether an entry, or one that it is nested in, is among `entries`."""
+    path = key if isinstance(key, tuple) else (key,)
+    return any(unravel_key(path[: i + 1]) in entries for i in range(len(path)))
 
 
 @dataclass

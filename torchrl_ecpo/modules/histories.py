@@ -54,6 +54,9 @@ def hash_states(*states: Tensor) -> Tensor:
     for i, state in enumerate(states):
         bits = state.detach().contiguous()
         aligned = bits.shape[-1] * bits.element_size() % 8 == 0
+        if len(bits) == 1 or bits.storage_offset() * bits.element_size() % 8:
+            # A row of a wider tensor passes for contiguous, wherever it begins.
+            bits = bits.clone(memory_format=torch.contiguous_format)
         bits = _fold(bits.view(torch.int64), 41) if aligned else bits.view(torch.uint8)
         total = total + (bits * _multipliers(bits.shape[-1], i, bits.device)).sum(-1)
     return total

@@ -91,10 +91,12 @@ class _RandomStreams(nn.Module):
         for generator, own in zip(self.generators, state.cpu(), strict=True):
             generator.set_state(own.clone())  # torch reads a view from its storage's beginning
 
-    def uniform(self, sizes: Sequence[int], width: int) -> Tensor:
-        """Numbers in [0, 1), `[sum(sizes), width]`: `sizes` rows of each run."""
+    def uniform(self, sizes: Sequence[int], like: Tensor) -> Tensor:
+        """Numbers in [0, 1) for logits, `[sum(sizes), width]`: `sizes` rows of each run."""
+        dtype = torch.promote_types(like.dtype, torch.float32)  # as TupleCategorical.sample
         parts = zip(sizes, self.generators, strict=True)
-        return torch.cat([torch.rand(size, width, generator=own) for size, own in parts])
+        draws = [torch.rand(n, like.shape[-1], generator=own, dtype=dtype) for n, own in parts]
+        return torch.cat(draws).view_as(like)
 
 
 def _stack_parameters(stacked: nn.Module, modules: Sequence[nn.Module]) -> None:
@@ -205,8 +207,7 @@ class _StackedTupleActor(ProbabilisticActor):
         logits = tensordict.get("logits")
         distribution = TupleCategorical(logits, **self.options)
         sizes = _count_rows(tensordict, self.core.num_runs)
-        uniform = self.streams.uniform(sizes, logits.shape[-1]).view_as(logits)
-        action = distribution.choose(uniform)
+        action = distribution.choose(self.streams.uniform(sizes, logits))
         tensordict.set("action", action)
         return tensordict.set("action_log_prob", distribution.log_prob(action))
 

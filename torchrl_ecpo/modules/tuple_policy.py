@@ -126,11 +126,11 @@ class TupleCategorical(Distribution):
         Returns:
             int64 `[*sample_shape, *B, 3]`.
         """
-        logits = self.logits.detach()
-        uniform = torch.rand(
-            (*sample_shape, *logits.shape), dtype=logits.dtype, device=logits.device
-        )
-        return self.choose(uniform)
+        logits = self.logits
+        # Numbers of half precision are so coarse that 0 is among a few hundred.
+        dtype = torch.promote_types(logits.dtype, torch.float32)
+        shape = (*sample_shape, *logits.shape)
+        return self.choose(torch.rand(shape, dtype=dtype, device=logits.device))
 
     def choose(self, uniform: Tensor) -> Tensor:
         """Draw actions with given randomness.

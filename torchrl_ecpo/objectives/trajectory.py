@@ -345,11 +345,11 @@ class TrajectoryGroupLoss(PolicyLoss):
 
     def _recorded_log_prob(self, tensordict: TensorDictBase, shape: torch.Size) -> Tensor | None:
         """Log-probability ``[*G, K, T]`` under the policy that drew the actions, if it is there."""
-        total = None
-        for key in _as_list(self.tensor_keys.sample_log_prob):
-            value = tensordict.get(key, None)
-            if value is None:
-                return None
+        total, keys = None, _as_list(self.tensor_keys.sample_log_prob)
+        if all(tensordict.get(key, None) is None for key in keys):
+            return None
+        for key in keys:
+            value = get_entry(tensordict, key)
             if is_tensor_collection(value):
                 value = _sum_parts(value)
             if value.shape != shape:
@@ -525,7 +525,7 @@ def _diagnostics(groups: TrajectoryGroups, weights: Tensor) -> dict[str, Tensor]
     of_reference = self_normalised_weights(log_ratio, mask=mask)
     of_policy = self_normalised_weights(log_prob - groups.behaviour_log_prob, mask=mask)
     uniform = self_normalised_weights(torch.zeros_like(log_prob), mask=mask)
-    returns = groups.returns
+    returns = groups.returns.detach()
     real = torch.ones_like(returns, dtype=torch.bool) if mask is None else mask
     highest = returns.where(real, -torch.inf).amax(-1)
     lowest = returns.where(real, torch.inf).amin(-1)
