@@ -267,7 +267,7 @@ def aggregates(study: Study, cells: Sequence[CellResult]) -> str:
     if None in units.values():
         return ""
     # One below 0 would turn the order round.
-    units = {name: unit for name, unit in units.items() if unit > 0}
+    units = {name: unit for name, unit in units.items() if unit is not None and unit > 0}
     if not units:
         return ""
     by_method = {}

@@ -349,7 +349,7 @@ class TrajectoryGroupLoss(PolicyLoss):
         if all(tensordict.get(key, None) is None for key in keys):
             return None
         for key in keys:
-            value = get_entry(tensordict, key)
+            value: Any = get_entry(tensordict, key)
             if is_tensor_collection(value):
                 value = _sum_parts(value)
             if value.shape != shape:
