@@ -345,6 +345,23 @@ def test_adam_has_a_group_for_each_learning_rate(utils):
     assert len(rates) == len(list(loss_module.parameters()))
 
 
+@pytest.mark.parametrize(
+    ("env", "rate", "gain"), [("pendulum", 1e-3, 1.0), ("ant", 1e-3, 1.0), ("humanoid", 3e-4, 0.01)]
+)
+def test_on_humanoid_ecac_s_policy_starts_small_and_learns_slower(utils, env, rate, gain):
+    config = configure([f"env={env}"])
+    assert config.loss.lr.actor_network == rate
+    pendulum = utils.make_environment(configure([]), seed=0)
+    actor = utils.make_actor(config, pendulum)  # of whichever task
+    assert next(iter(actor)).final_gain == gain
+
+
+@pytest.mark.parametrize("loss", [name for name in LOSSES if name != "ecac"])
+def test_the_others_are_on_humanoid_as_they_are_elsewhere(loss):
+    there, elsewhere = (configure([f"env={env}", f"loss={loss}"]).loss for env in ("humanoid", "ant"))
+    assert there == elsewhere
+
+
 def test_every_asks_once_an_interval(utils):
     every = utils.Every(10)
     assert [count for count in range(4, 60, 4) if every(count)] == [12, 20, 32, 40, 52]

@@ -61,7 +61,11 @@ LOSSES = {
     "td3": TD3Loss,
     "ddpg": DDPGLoss,
 }
-ACTORS = {"tanh_gaussian": make_tanh_gaussian_actor, "deterministic": make_deterministic_actor}
+ACTORS = {
+    "tanh_gaussian": make_tanh_gaussian_actor,
+    "tanh_gaussian_small_start": partial(make_tanh_gaussian_actor, final_gain=0.01),
+    "deterministic": make_deterministic_actor,
+}
 TEMPERATURES = ("tau", "tau_prime")
 SHOWN = ("evaluation_return", "return", "entropy", "alpha", "tau", "tau_prime", "steps_per_second")
 LONGEST_EPISODE = 100_000

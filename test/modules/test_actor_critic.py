@@ -286,6 +286,42 @@ def test_a_dense_network_starts_as_layers_of_torch_do():
     assert (network.weight_0 != before).float().mean() > 0.99
 
 
+def test_a_final_gain_is_a_factor_of_the_last_layer_alone():
+    def start(**options):
+        torch.manual_seed(0)
+        return DenseNetwork(["a"], ["out"], [100, 50, 2], **options)
+
+    usual, small = start(), start(final_gain=0.01)
+    for again in (False, True):
+        if again:
+            for network in (usual, small):
+                torch.manual_seed(1)
+                network.reset_parameters()
+        for name, parameter in small.named_parameters():
+            factor = 0.01 if name.endswith("_1") else 1.0
+            torch.testing.assert_close(parameter, factor * getattr(usual, name))
+    assert start(final_gain=0)(a=torch.randn(5, 100)).abs().max() == 0
+
+
+@pytest.mark.parametrize("gain", [-0.1, float("nan"), float("inf")])
+def test_a_final_gain_that_is_none_is_refused(gain):
+    with pytest.raises(ValueError, match="final_gain must be at least 0 and finite, got"):
+        make_tanh_gaussian_actor(3, SPEC, final_gain=gain)
+
+
+def test_with_a_small_final_gain_a_policy_starts_in_the_middle_whatever_it_observes():
+    large = TensorDict({"observation": 300 * torch.randn(200, 50)}, [200])
+
+    def start(**options):
+        torch.manual_seed(0)
+        return make_tanh_gaussian_actor(50, SPEC, **options).get_dist(large)
+
+    assert start().base_dist.base_dist.loc.abs().max() > 20
+    small = start(final_gain=0.01)
+    assert small.base_dist.base_dist.loc.abs().max() < 1
+    torch.testing.assert_close(small.scale.log(), torch.zeros(200, 2), atol=1.0, rtol=0)
+
+
 @pytest.mark.parametrize("make", ACTORS)
 @pytest.mark.parametrize("exploration", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
 def test_actions_fill_their_bounds_and_stay_within(make, exploration):

@@ -7,6 +7,7 @@ within the bounds of its specification.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
@@ -55,6 +56,12 @@ class DenseNetwork(TensorDictModuleBase):
         head: from the output of the last layer to the tuple of entries; by default it is the one
             entry.
 
+    Keyword Args:
+        final_gain: factor of the last layer's parameters at the start. Default: 1.
+
+    Raises:
+        ValueError: if ``final_gain`` is negative or not finite.
+
     Examples:
         >>> import torch
         >>> network = DenseNetwork(["observation"], ["state_value"], [3, 8, 1])
@@ -68,11 +75,16 @@ class DenseNetwork(TensorDictModuleBase):
         out_keys: Sequence[Any],
         sizes: Sequence[int],
         head: Callable[[Tensor], tuple[Tensor, ...]] | None = None,
+        *,
+        final_gain: float = 1.0,
     ) -> None:
         super().__init__()
+        if not 0 <= final_gain < math.inf:
+            raise ValueError(f"final_gain must be at least 0 and finite, got {final_gain}.")
         self.in_keys, self.out_keys = list(in_keys), list(out_keys)
         self.sizes = tuple(sizes)
         self.head = head
+        self.final_gain = final_gain
         self._names = [name for i in range(len(sizes) - 1) for name in (f"weight_{i}", f"bias_{i}")]
         for weight, bias, fan_in, fan_out in self._layers():
             self.register_parameter(weight, nn.Parameter(torch.empty(fan_out, fan_in)))
@@ -80,10 +92,16 @@ class DenseNetwork(TensorDictModuleBase):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Draw all parameters anew, as ``torch.nn.Linear`` does: uniform up to 1/sqrt(fan-in)."""
+        """Draw all parameters anew, as ``torch.nn.Linear`` does: uniform up to 1/sqrt(fan-in).
+
+        Those of the last layer: times ``final_gain``.
+        """
         for weight, bias, fan_in, _ in self._layers():
             for name in (weight, bias):
                 nn.init.uniform_(getattr(self, name), -(fan_in**-0.5), fan_in**-0.5)
+        with torch.no_grad():
+            for name in self._names[-2:]:
+                getattr(self, name).mul_(self.final_gain)
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -285,6 +303,7 @@ def make_tanh_gaussian_actor(
     *,
     hidden_sizes: Sequence[int] = HIDDEN_SIZES,
     log_scale_bounds: tuple[float, float] = LOG_SCALE_BOUNDS,
+    final_gain: float = 1.0,
 ) -> ProbabilisticTensorDictSequential:
     """A stochastic policy: a Gaussian, squashed by tanh into the bounds of the actions.
 
@@ -296,10 +315,15 @@ def make_tanh_gaussian_actor(
         hidden_sizes: units of each hidden layer.
         log_scale_bounds: of the Gaussian before tanh. Default: (-5, 2); 2 is SAC's, its -20 is
             never reached, and a scale of e^-5 acts like none.
+        final_gain: factor of the last layer's parameters at the start. Default: 1. With 0.01 the
+            policy starts in the middle of the actions' range with a scale of 1, whatever it
+            observes; where observations are large, as the forces in ``Humanoid-v5`` are, it would
+            start at the ends of the range. The value is that of "What Matters In On-Policy
+            Reinforcement Learning?", Andrychowicz et al., 2021.
 
     Raises:
-        ValueError: if the actions are not vectors of bounded numbers, or if the bounds of the scale
-            are not in order.
+        ValueError: if the actions are not vectors of bounded numbers, if the bounds of the scale
+            are not in order, or if ``final_gain`` is negative or not finite.
 
     Examples:
         >>> import torch
@@ -319,6 +343,7 @@ def make_tanh_gaussian_actor(
         ["loc", "scale"],
         [observation_size, *hidden_sizes, 2 * spec.shape[-1]],
         partial(_loc_and_scale, log_scale_bounds=log_scale_bounds),
+        final_gain=final_gain,
     )
     return ProbabilisticActor(
         network,
