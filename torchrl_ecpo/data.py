@@ -467,23 +467,30 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
         storage, writer = self._parts(storage)
         index = torch.as_tensor(index, dtype=torch.long).reshape(-1).cpu()
         written = writer._write_count
+        if written == self._seen:
+            self._edit(storage, index)
+            return
         if self._seen is None:
             if len(storage) > index.numel():
                 return  # the storage was not empty: the first draw indexes all of it
-        elif written - self._seen not in (0, index.numel()):
+        elif written - self._seen != index.numel():
             return  # another process has written too: the next draw indexes both
-        tail = self._tail
-        if written == self._seen:  # an edit in place: whatever is being written goes on after it
-            self._tail = None
-            # The trajectories that it concerns, whole and in order. What was none stays none.
-            edited = self._owner[index].unique()
-            edited = edited[edited >= 0]
-            index, _ = self._slots(edited, self._length[edited])
         if index.numel():
             self._index(storage, index)
-        if written == self._seen:
-            self._tail = tail
         self._seen = written
+
+    def _edit(self, storage: TensorStorage, index: Tensor) -> None:
+        """Index anew the trajectories that a change in place concerns, whole and in order.
+
+        What was none stays none.
+        """
+        edited = self._owner[index].unique()
+        edited = edited[edited >= 0]
+        index, _ = self._slots(edited, self._length[edited])
+        if index.numel():
+            tail, self._tail = self._tail, None  # whatever is being written goes on after it
+            self._index(storage, index)
+            self._tail = tail
 
     def _parts(self, storage: Storage) -> tuple[TensorStorage, RoundRobinWriter]:
         """Return the storage and its writer, if they are of the kind that can be followed."""

@@ -145,13 +145,17 @@ class DenseNetwork(TensorDictModuleBase):
         return zip(self._names[::2], self._names[1::2], self.sizes, self.sizes[1:], strict=False)
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
-        """The inputs side by side; if some are repeated beside others that are not, each alone."""
+        """The inputs side by side; if some are repeated beside others that are not, each alone.
+
+        Of those that are repeated the first, ``[1, ...]``.
+        """
         inputs = [tensordict.get(key) for key in self.in_keys]
         if len(inputs) == 1:
             return inputs
-        fit = len({(x.shape[:-1], x.dtype) for x in inputs}) == 1
-        if fit and len({_is_repeated(x) for x in inputs}) > 1:
-            return inputs
+        if len({(x.shape[:-1], x.dtype) for x in inputs}) == 1:
+            repeated = [_is_repeated(x) for x in inputs]
+            if any(repeated) and not all(repeated):
+                return [x[:1] if once else x for x, once in zip(inputs, repeated, strict=True)]
         return [torch.cat(inputs, -1)]
 
     @staticmethod
@@ -160,7 +164,7 @@ class DenseNetwork(TensorDictModuleBase):
         x = _first_layer(inputs, weight, bias)
         for weight, bias in others:
             x = _product(x.relu_(), weight, bias)  # what goes into ReLU is read by nobody else
-        batch_shape = inputs[0].shape[:-1]
+        batch_shape = torch.broadcast_shapes(*(each.shape[:-1] for each in inputs))
         return x.unflatten(0, batch_shape) if len(batch_shape) > 1 else x
 
     def _write(self, output: Tensor, tensordict: TensorDictBase) -> TensorDictBase:
@@ -171,17 +175,17 @@ class DenseNetwork(TensorDictModuleBase):
 
 
 def _first_layer(inputs: Sequence[Tensor], weight: Tensor, bias: Tensor) -> Tensor:
-    """The product of a layer with inputs side by side, in rows; with what is repeated, once."""
+    """The product of a layer with inputs side by side, in rows; of ``[1, ...]``, for all rows."""
     if len(inputs) == 1:
         return _product(_in_rows(inputs[0]), weight, bias)
     shared, own = bias, []
     for x, columns in zip(inputs, weight.split([x.shape[-1] for x in inputs], -1), strict=True):
-        if _is_repeated(x):
-            shared = shared + _product(_in_rows(x[0]), columns, None)
+        product = _product(_in_rows(x), columns, None).unflatten(0, (len(x), -1))
+        if len(x) == 1:
+            shared = shared + product
         else:
-            own.append(_product(_in_rows(x), columns, None))
-    total = sum(own[1:], own[0]).unflatten(0, (len(inputs[0]), -1))
-    return total.add_(shared).flatten(0, 1)
+            own.append(product)
+    return sum(own[1:], own[0]).add_(shared).flatten(0, 1)
 
 
 def _is_repeated(x: Tensor) -> bool:
