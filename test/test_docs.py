@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 import shlex
 import subprocess
@@ -44,6 +45,8 @@ STATED_FOR = {
     "bandit": (ECPO_CONFIG, ("bandit",)),
     "gymnasium": (ECPO_CONFIG, ("gym",)),
     "MuJoCo tasks": (ECAC_CONFIG, MUJOCO_TASKS),
+    "all but Humanoid-v5": (ECAC_CONFIG, MUJOCO_TASKS[:-1]),
+    "Humanoid-v5": (ECAC_CONFIG, MUJOCO_TASKS[-1:]),
     **dict.fromkeys(("PMD-AC", "SAC", "TD3", "DDPG"), (ECAC_CONFIG, MUJOCO_TASKS)),
 }
 
@@ -178,6 +181,19 @@ def test_the_settings_that_the_search_chose_are_those_of_the_configuration():
             asked = OmegaConf.from_dotlist(optimisers[config.env.curriculum].split())
             assert config.optim.amsgrad == asked.optim.amsgrad
             assert config.optim.eps == asked.optim.eps
+
+
+def test_the_study_takes_as_long_as_is_said():
+    results = ROOT / "sota-implementations/results/study"
+    seconds = {
+        (run["options"], run["seed"]): float(run["seconds"])
+        for path in results.glob("*/runs.csv")
+        for run in csv.DictReader(path.read_text().splitlines())
+        if run["seconds"]
+    }
+    assert 30 < sum(seconds.values()) / 3600 < 40
+    for page in (DOCS / "tutorials/many_runs.md", ROOT / "sota-implementations/README.md"):
+        assert "more than thirty hours" in " ".join(page.read_text().split())
 
 
 def test_the_page_of_equations_names_tests_that_exist():

@@ -5,12 +5,13 @@ import math
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
 from torchrl_ecpo.experiment import MetricsTable, Run, read_metrics
 from torchrl_ecpo.experiment.compare import find_runs, load_comparison
 from torchrl_ecpo.experiment.compare import main as compare
-from torchrl_ecpo.experiment.figures import smooth
+from torchrl_ecpo.experiment.figures import _draw_curves, smooth
 
 PNG = b"\x89PNG\r\n"
 
@@ -166,6 +167,14 @@ def test_compare_prints_a_table_and_writes_picture_and_curves(runs, capsys):
     lines = table.read_text().splitlines()
     assert lines[0] == "method,run,step,return"
     assert lines[-1] == "urex,0,30,2"
+
+
+def test_a_curve_of_one_point_is_seen():
+    panel = Figure().subplots()
+    steps, values = np.array([5.0, 10.0]), np.array([[1.0, 2.0], [2.0, 3.0]])
+    curves = {"one": (steps[:1], values[:, :1]), "two": (steps, values)}
+    _draw_curves(panel, curves, dict.fromkeys(curves, "k"), {name: name for name in curves})
+    assert [line.get_marker() for line in panel.lines] == ["o", "None"]
 
 
 def test_methods_are_told_apart_by_what_is_null_too(runs):

@@ -196,7 +196,8 @@ def _draw_curves(
 ) -> None:
     for method, (steps, values) in curves.items():
         mean, runs = np.nanmean(values, axis=0), len(values)
-        panel.plot(steps, mean, color=colours[method], label=labels[method])
+        marker = "o" if np.isfinite(mean).sum() == 1 else None  # a line needs two points
+        panel.plot(steps, mean, color=colours[method], label=labels[method], marker=marker)
         if runs > 1:
             error = np.nanstd(values, axis=0, ddof=1) / np.sqrt(runs)
             low, high = mean - error, mean + error
