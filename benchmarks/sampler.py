@@ -16,7 +16,7 @@ from csv_table import add_csv_option, write_csv
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torchrl_ecpo.data import TrajectoryGroupSampler
+from torchrl_ecpo.groups import TrajectoryGroupSampler
 
 GROUP_SIZE, NUM_GROUPS = 10, 40
 MEAN_LENGTH = 10

@@ -31,8 +31,8 @@ from torchrl.envs import (
 from torchrl.modules import LSTMModule, RandomPolicy, get_env_transforms_from_module
 
 from torchrl_ecpo.collectors import TrajectoryGroupCollector, shut_down
-from torchrl_ecpo.data import TrajectoryGroupSampler, pack_groups, unpack_groups
 from torchrl_ecpo.envs._groups import GroupIdAllocator
+from torchrl_ecpo.groups import TrajectoryGroupSampler, pack_groups, unpack_groups
 
 
 class Countdown(EnvBase):

@@ -26,9 +26,9 @@ from utils import Parts, is_single, make_loss, make_run, make_temperatures
 
 from torchrl_ecpo import TrajectoryGroupLoss
 from torchrl_ecpo.collectors import TrajectoryGroupCollector
-from torchrl_ecpo.data import MASK_KEY
 from torchrl_ecpo.envs import stack_envs
 from torchrl_ecpo.experiment import Run
+from torchrl_ecpo.groups import MASK_KEY
 from torchrl_ecpo.modules import stack_policies
 from torchrl_ecpo.schedules import TemperatureScheduler
 

@@ -21,8 +21,8 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_ecpo.data import TrajectoryGroupSampler
 from torchrl_ecpo.envs.grouped import GroupedEnv
+from torchrl_ecpo.groups import TrajectoryGroupSampler
 
 # A function of this module could not be imported by worker processes.
 cartpole = partial(GymEnv, "CartPole-v1")

@@ -36,7 +36,7 @@ from torchrl_ecpo.collectors.supervised import (
     SupervisedSyncCollector,
     describe_death,
 )
-from torchrl_ecpo.data import GROUP_KEY, MASK_KEY, TRAJECTORY_KEY, pack_groups, unpack_groups
+from torchrl_ecpo.groups import GROUP_KEY, MASK_KEY, TRAJECTORY_KEY, pack_groups, unpack_groups
 
 __all__ = ["TrajectoryGroupCollector"]
 
@@ -106,7 +106,7 @@ class TrajectoryGroupCollector(Collector, metaclass=_GroupCollectorMeta):
 
     - yields batches `[G, K, T]` padded to the longest trajectory, with ``("collector", "mask")``,
       or, given a `replay_buffer`, writes their steps flat, for
-      :class:`~torchrl_ecpo.data.TrajectoryGroupSampler`;
+      :class:`~torchrl_ecpo.groups.TrajectoryGroupSampler`;
     - is on-policy by the letter of Algorithm 1: all trajectories of a batch come from the same
       weights. The collector samples from a copy of the policy, the reference, which changes only
       when :meth:`update_policy_weights_` is called, on every backend. If that happens within a

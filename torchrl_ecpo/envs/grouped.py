@@ -14,8 +14,8 @@ from torchrl.data import Unbounded
 from torchrl.data.utils import CloudpickleWrapper
 from torchrl.envs import EnvBase, GymWrapper, ParallelEnv, SerialEnv, TransformedEnv
 
-from torchrl_ecpo.data import GROUP_KEY
 from torchrl_ecpo.envs._groups import GroupIdAllocator
+from torchrl_ecpo.groups import GROUP_KEY
 
 __all__ = ["GroupedEnv"]
 

@@ -16,9 +16,9 @@ from torch import Tensor, nn
 from torchrl.data import Categorical
 from torchrl.envs import EnvBase
 
-from torchrl_ecpo.data import RUN_KEY
 from torchrl_ecpo.envs.algorithmic import AlgorithmicEnv
 from torchrl_ecpo.envs.bandit import BanditEnv
+from torchrl_ecpo.groups import RUN_KEY
 
 __all__ = ["stack_envs"]
 

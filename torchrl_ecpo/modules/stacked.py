@@ -20,7 +20,7 @@ from torch.distributions import Categorical
 from torch.nn import functional as F
 from torchrl.modules import ProbabilisticActor
 
-from torchrl_ecpo.data import RUN_KEY
+from torchrl_ecpo.groups import RUN_KEY
 from torchrl_ecpo.modules.histories import Histories, distinct_histories
 from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
 from torchrl_ecpo.modules.softmax import LinearSoftmax

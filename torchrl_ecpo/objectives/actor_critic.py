@@ -25,6 +25,13 @@ from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator, dista
 from torchrl.objectives.value import TD0Estimator, TD1Estimator, TDLambdaEstimator
 from torchrl.objectives.value.advantages import ValueEstimatorBase
 
+from torchrl_ecpo.checks import (
+    as_float,
+    check_choice,
+    check_count,
+    get_entry,
+    values_can_be_seen,
+)
 from torchrl_ecpo.functional import (
     effective_sample_size,
     lift_divergence_estimate,
@@ -34,14 +41,7 @@ from torchrl_ecpo.functional import (
     soft_value_estimate,
     temperature_dual,
 )
-from torchrl_ecpo.objectives._base import (
-    PolicyLoss,
-    as_float,
-    check_choice,
-    check_count,
-    get_entry,
-    values_can_be_seen,
-)
+from torchrl_ecpo.objectives._base import PolicyLoss
 from torchrl_ecpo.objectives.actions import (
     SampledActions,
     is_discrete,

@@ -9,8 +9,8 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
 from torch.distributions import Distribution
 
+from torchrl_ecpo.checks import check_choice, check_count
 from torchrl_ecpo.functional import centred_gaussian_projection, mean_seeking_projection
-from torchrl_ecpo.objectives._base import check_choice, check_count
 from torchrl_ecpo.objectives.actions import gaussian_parameters, log_prob_of
 from torchrl_ecpo.objectives.actor_critic import (
     ContinuousActorCriticLoss,

@@ -20,13 +20,14 @@ from tensordict.nn import (
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_ecpo.checks import get_entry, values_can_be_seen
 from torchrl_ecpo.functional import (
     Surrogate,
     effective_sample_size,
     lifted_log_weights,
     self_normalised_weights,
 )
-from torchrl_ecpo.objectives._base import PolicyLoss, get_entry, values_can_be_seen
+from torchrl_ecpo.objectives._base import PolicyLoss
 
 __all__ = ["LiftProjectLoss", "TrajectoryGroupLoss", "TrajectoryGroups"]
 

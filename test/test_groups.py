@@ -17,7 +17,7 @@ from torchrl.data import (
     TensorStorage,
 )
 
-from torchrl_ecpo.data import TrajectoryGroupSampler, pack_groups, unpack_groups
+from torchrl_ecpo.groups import TrajectoryGroupSampler, pack_groups, unpack_groups
 
 
 def make_steps(trajectories, *, first_id=0, ended=True, traj_ids=True):
