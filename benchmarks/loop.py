@@ -231,7 +231,7 @@ def bare_loop(
             for values in (log_prob, steps.log_prob, steps.reward)
         )
         lift = lifted_log_weights(returns, reference_log_prob, tau=TAU, tau_prime=TAU_PRIME)
-        loss, _ = mean_seeking_projection(log_prob, lift)
+        loss = mean_seeking_projection(log_prob, lift).loss
         optimizer.zero_grad()
         loss.mean().backward()
         clip_grad_norm_(core.parameters(), MAX_GRAD_NORM)

@@ -209,7 +209,7 @@ def test_effective_sample_size_by_hand(dtype, weights, expected):
 def test_mean_seeking_projection_by_hand(dtype):
     log_prob = vector(-1, -2, -3, dtype=dtype)
     log_weights = vector(1, 2, 5, dtype=dtype).log()
-    loss, weights = mean_seeking_projection(log_prob, log_weights)
+    loss, weights, *_ = mean_seeking_projection(log_prob, log_weights)
     assert_close(weights, vector(1 / 8, 2 / 8, 5 / 8, dtype=dtype))
     assert_close(loss.item(), (1 * 1 + 2 * 2 + 5 * 3) / 8)
     grad = gradient(lambda x: mean_seeking_projection(x, log_weights).loss, log_prob)
@@ -266,7 +266,7 @@ def test_urex_surrogate_by_hand(dtype):
     # r / tau - log pi = 1, 1 + log 3, so w = 1/4, 3/4; S = 0 + 1/4, .5 log 1.5 + 3/4.
     log_prob = vector(-1, -1 - math.log(2), dtype=dtype)
     score = vector(0, 0.5 * math.log(1.5), dtype=dtype)
-    loss, weights = urex_surrogate(log_prob, score, tau=0.5)
+    loss, weights, *_ = urex_surrogate(log_prob, score, tau=0.5)
     quarter = (0.5 + 0.5 * math.log(1.5)) / 4  # half the distance to the mean, over K
     assert_close(weights, vector(0.25, 0.75, dtype=dtype))
     assert_close(loss.item(), quarter * math.log(2))
@@ -277,7 +277,7 @@ def test_urex_surrogate_by_hand(dtype):
 @DTYPES
 def test_ment_surrogate_by_hand(dtype):
     log_prob, score = vector(-2, -1, -3, dtype=dtype), vector(1, 2, 3, dtype=dtype)
-    loss, weights = ment_surrogate(log_prob, score, tau=0.5)  # S = 2, 2.5, 4.5; mean 3
+    loss, weights, *_ = ment_surrogate(log_prob, score, tau=0.5)  # S = 2, 2.5, 4.5; mean 3
     assert_close(weights, vector(1 / 3, 1 / 3, 1 / 3, dtype=dtype))
     assert_close(loss.item(), -(-1 * -2 - 0.5 * -1 + 1.5 * -3) / 3)
     grad = gradient(lambda x: ment_surrogate(x, score, tau=0.5).loss, log_prob)
@@ -632,7 +632,7 @@ def test_masked_samples_have_no_influence_whatever_stands_in_them(name, x, data)
 @every_surrogate
 def test_only_the_log_probability_carries_a_gradient(name):
     samples = random_samples(3, 5).map(lambda y: y.requires_grad_())
-    loss, weights = SURROGATES[name](samples, 0.5, 0.25)
+    loss, weights, *_ = SURROGATES[name](samples, 0.5, 0.25)
     assert not weights.requires_grad
     loss.sum().backward()
     assert samples.log_prob.grad is not None
@@ -654,7 +654,9 @@ def test_a_state_without_a_real_sample_leaves_the_gaussian_as_it_is():
     loc, scale = (torch.full((2, 3), value, requires_grad=True) for value in (2.0, 0.5))
     mask = torch.tensor([[True] * 4, [False] * 4])
     samples = torch.randn(2, 4, 3)
-    loss, weights = centred_gaussian_projection(loc, scale, samples, torch.randn(2, 4), mask=mask)
+    loss, weights, *_ = centred_gaussian_projection(
+        loc, scale, samples, torch.randn(2, 4), mask=mask
+    )
     assert loss[1] == 0
     assert (weights[1] == 0).all()
     loss.sum().backward()
@@ -951,7 +953,7 @@ def test_centred_projection_trains_the_policy_only():
     }
     for tensor in tensors.values():
         tensor.requires_grad_()
-    loss, weights = centred_gaussian_projection(**tensors, sample_dim=0)
+    loss, weights, *_ = centred_gaussian_projection(**tensors, sample_dim=0)
     assert not weights.requires_grad
     loss.sum().backward()
     trained = [name for name, tensor in tensors.items() if tensor.grad is not None]
@@ -1218,6 +1220,6 @@ def test_differences_of_log_probabilities_may_overflow():
         mode_seeking_projection(large, -large, torch.zeros(2)),
         mean_seeking_projection(large, torch.zeros(2), control_log_prob=-large),
     ]
-    for loss, weights in projections:
+    for loss, weights, *_ in projections:
         assert loss.isfinite()
         assert weights.isfinite().all()

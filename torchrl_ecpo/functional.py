@@ -22,26 +22,32 @@ reference_log_prob   log pi_bar       under the reference policy, which is lifte
 behaviour_log_prob   log beta         under the policy that drew the samples
 tau                  tau >= 0         temperature of the divergence from the reference
 tau_prime            tau' >= 0        temperature of the entropy
-mask                                  True where a sample is real; absent means all are
+sample_dim                            the axis of the samples; the last by default
+mask                                  ``[E*, K]``, True where a sample is real (an action is
+                                      allowed); None, the default: all are
 ==================== ================ =====================================================
 
-Temperatures are floats or 0-d tensors, in the unit of the score. Floats are checked; tensors are
-taken as they are, so that nothing waits for a device. Finite input never gives NaN, as long as the
-temperatures are neither 0 nor infinite in the dtype of the scores (from 1e-37 to 1e38 in float32).
-Half precision is too narrow for sums over trajectories: give float32, as the losses do.
-A group in which all samples are masked has weights and a loss of 0, and no soft value.
+Where an argument is what the table says, its function does not say it again. Temperatures are
+floats or 0-d tensors, in the unit of the score. Floats are checked; tensors are taken as they are,
+so that nothing waits for a device. Finite input never gives NaN, as long as the temperatures are
+neither 0 nor infinite in the dtype of the scores (from 1e-37 to 1e38 in float32). Half precision is
+too narrow for sums over trajectories: give float32, as the losses do. A group in which all samples
+are masked has weights and a loss of 0, and no soft value.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import NamedTuple, TypedDict
 
 import torch
 from torch import Tensor
 
 __all__ = [
     "Surrogate",
+    "centred",
     "centred_gaussian_projection",
     "check_temperatures",
     "effective_sample_size",
@@ -50,24 +56,40 @@ __all__ = [
     "mean_seeking_projection",
     "ment_surrogate",
     "mode_seeking_projection",
+    "score_function_loss",
     "self_normalised_weights",
     "soft_value",
     "soft_value_estimate",
+    "standardised",
     "surrogate_reward",
     "surrogate_reward_estimate",
     "temperature_dual",
     "theorem1_temperatures",
+    "uniform_weights",
     "urex_surrogate",
+    "weighted_sum",
 ]
 
 
 class Surrogate(NamedTuple):
-    """A loss whose gradient is an estimator of the paper's, and the weights it gave the samples."""
+    """What a member of the family returns: a loss, the weights behind it, and what else it found.
+
+    Only ``loss`` and ``weights`` come from the functions of this module.
+    """
 
     loss: Tensor
     """``[E*]``: differentiate with respect to the parameters behind ``log_prob``."""
-    weights: Tensor
-    """``[E*, K]``, detached: non-negative, summing to one over real samples."""
+    weights: Tensor | None
+    """``[E*, K]``, detached: non-negative, summing to 1 over real samples. None without a lift."""
+    losses: Mapping[str, Tensor] = MappingProxyType({})
+    """Further losses by their full names (``"loss_eta"``), ``[E*]`` or 0-d."""
+    metrics: Mapping[str, Tensor] = MappingProxyType({})
+    """Further metrics by name (``"clip_fraction"``), ``[E*]`` or 0-d."""
+
+
+class _Where(TypedDict):
+    sample_dim: int
+    mask: Tensor | None
 
 
 # --------------------------------------------------------------------------------------- the lift
@@ -119,8 +141,6 @@ def lifted_log_weights(
     Args:
         score: ``[...]``, the return of a trajectory or the value of an action.
         reference_log_prob: ``[...]``, log-probability under the reference policy, in nats.
-        tau: temperature of the divergence from the reference.
-        tau_prime: temperature of the entropy.
 
     Returns:
         ``[...]``, unnormalised. Add ``reference_log_prob`` for the lifted log-probability up to a
@@ -147,8 +167,6 @@ def self_normalised_weights(
 
     Args:
         log_weights: ``[E*, K]``.
-        sample_dim: the axis of the K samples.
-        mask: ``[E*, K]``, True where a sample is real.
 
     Returns:
         ``[E*, K]``, summing to one; 0 where masked. A group without a real sample is all zeros.
@@ -173,7 +191,6 @@ def effective_sample_size(weights: Tensor, *, sample_dim: int = -1) -> Tensor:
 
     Args:
         weights: ``[E*, K]``, non-negative, normalised or not.
-        sample_dim: the axis of the K samples.
 
     Returns:
         ``[E*]``, from 1 (one sample has all the weight) to K (all are equal); 0 for a group
@@ -207,8 +224,6 @@ def lift_divergence_estimate(
 
     Args:
         weights: ``[E*, M]``, :func:`self_normalised_weights` of samples that the reference drew.
-        sample_dim: the axis of the M samples.
-        mask: ``[E*, M]``, True where a sample is real.
 
     Returns:
         ``[E*]``, in nats, from 0 (equal weights) to log M (all weight on one sample).
@@ -219,7 +234,7 @@ def lift_divergence_estimate(
     """
     # 0 log 0 = 0
     log_ratio = weights.clamp_min(_tiny(weights)).log() - _log_uniform(weights, sample_dim, mask)
-    return _weighted_sum(weights, log_ratio, sample_dim, mask).clamp_min(0.0)
+    return weighted_sum(weights, log_ratio, sample_dim=sample_dim, mask=mask).clamp_min(0.0)
 
 
 def temperature_dual(log_temperature: Tensor, excess: Tensor) -> Tensor:
@@ -271,8 +286,6 @@ def mean_seeking_projection(
             given, the self-normalised ratio softmax_k(log_prob - control_log_prob) is subtracted
             from each weight: a control variate whose expectation tends to zero, which removes the
             drift of groups in which all weights are equal. Not in the paper; ours.
-        sample_dim: the axis of the K samples.
-        mask: ``[E*, K]``, True where a sample is real.
 
     Returns:
         :class:`Surrogate`: its loss ``[E*]`` is the cross-entropy to the target (minus that to the
@@ -282,18 +295,19 @@ def mean_seeking_projection(
         Weights 3/4 and 1/4; 0.75 * 2 + 0.25 * 1 = 1.75:
 
         >>> log_prob = torch.tensor([-2.0, -1.0], requires_grad=True)
-        >>> loss, weights = mean_seeking_projection(log_prob, torch.tensor([3.0, 1.0]).log())
+        >>> loss, weights, *_ = mean_seeking_projection(log_prob, torch.tensor([3.0, 1.0]).log())
         >>> loss.backward(); loss.detach(), log_prob.grad
         (tensor(1.7500), tensor([-0.7500, -0.2500]))
     """
-    weights = self_normalised_weights(log_weights.detach(), sample_dim=sample_dim, mask=mask)
+    where: _Where = {"sample_dim": sample_dim, "mask": mask}
+    weights = self_normalised_weights(log_weights.detach(), **where)
     coefficients = weights
     if control_log_prob is not None:
         log_ratio = _representable((log_prob - control_log_prob).detach())
-        coefficients = weights - self_normalised_weights(
-            log_ratio, sample_dim=sample_dim, mask=mask
-        )
-    return Surrogate(-_weighted_sum(coefficients, log_prob, sample_dim, mask), weights)
+        coefficients = weights - self_normalised_weights(log_ratio, **where)
+    return Surrogate(
+        -weighted_sum(coefficients, log_prob, sample_dim=sample_dim, mask=mask), weights
+    )
 
 
 def centred_gaussian_projection(
@@ -338,7 +352,6 @@ def centred_gaussian_projection(
         log_weights: ``[E*, M]``, log-weight of the target relative to the distribution that drew
             the samples, up to a constant per state.
         sample_dim: the axis of the M samples, in ``log_weights``.
-        mask: ``[E*, M]``, True where a sample is real.
 
     Returns:
         :class:`Surrogate`: the loss ``[E*]`` in nats, a cross-entropy with the variance above, and
@@ -350,7 +363,7 @@ def centred_gaussian_projection(
 
         >>> loc, scale = torch.zeros(1, requires_grad=True), torch.ones(1, requires_grad=True)
         >>> samples = torch.tensor([[1.0], [3.0]])
-        >>> loss, weights = centred_gaussian_projection(loc, scale, samples, torch.zeros(2))
+        >>> loss, weights, *_ = centred_gaussian_projection(loc, scale, samples, torch.zeros(2))
         >>> loss.backward(); loc.grad, scale.grad
         (tensor([-2.]), tensor([-1.]))
     """
@@ -405,8 +418,6 @@ def mode_seeking_projection(
             *reference*, whoever drew the samples.
         behaviour_log_prob: ``[E*, K]``, under the policy that drew the samples; the reference by
             default.
-        sample_dim: the axis of the K samples.
-        mask: ``[E*, K]``, True where a sample is real.
 
     Returns:
         :class:`Surrogate`: a loss ``[E*]`` whose gradient estimates that of KL(pi, target), but
@@ -416,7 +427,8 @@ def mode_seeking_projection(
         At pi = pi_bar the ratios are equal, and the weights 1 and 0 give A - mean = +-1/2:
 
         >>> log_prob = torch.tensor([-2.0, -1.0], requires_grad=True)
-        >>> loss, v = mode_seeking_projection(log_prob, log_prob.detach(), torch.tensor([1.0, 0.0]))
+        >>> reference, log_weights = log_prob.detach(), torch.tensor([1.0, 0.0])
+        >>> loss, v, *_ = mode_seeking_projection(log_prob, reference, log_weights)
         >>> loss.backward(); v, log_prob.grad
         (tensor([0.5000, 0.5000]), tensor([-0.2500,  0.2500]))
     """
@@ -427,8 +439,9 @@ def mode_seeking_projection(
     log_ratio = _representable(current - behaviour_log_prob)
     ratios = self_normalised_weights(log_ratio, sample_dim=sample_dim, mask=mask)
     advantage = _representable(log_weights - _representable(current - reference_log_prob))
-    advantage = advantage - _weighted_sum(ratios, advantage, sample_dim, mask, keepdim=True)
-    return Surrogate(-_weighted_sum(ratios * advantage, log_prob, sample_dim, mask), ratios)
+    where: _Where = {"sample_dim": sample_dim, "mask": mask}
+    advantage = advantage - weighted_sum(ratios, advantage, **where, keepdim=True)
+    return Surrogate(-weighted_sum(ratios * advantage, log_prob, **where), ratios)
 
 
 def urex_surrogate(
@@ -453,8 +466,6 @@ def urex_surrogate(
         log_prob: ``[E*, K]``, log-probability of each sample under the policy being trained.
         score: ``[E*, K]``.
         tau: UREX's temperature; above 0.
-        sample_dim: the axis of the K samples.
-        mask: ``[E*, K]``, True where a sample is real.
 
     Returns:
         :class:`Surrogate`: its weights are w.
@@ -467,18 +478,19 @@ def urex_surrogate(
 
         >>> log_prob = torch.tensor([-1.0, -1.0], requires_grad=True)
         >>> tau = 1 / math.log(3)
-        >>> loss, weights = urex_surrogate(log_prob, torch.tensor([1.0, 0.0]), tau=tau)
+        >>> loss, weights, *_ = urex_surrogate(log_prob, torch.tensor([1.0, 0.0]), tau=tau)
         >>> loss.backward(); weights, log_prob.grad * 4 / (1 + tau)
         (tensor([0.7500, 0.2500]), tensor([-1.,  1.]))
     """
     check_temperatures(tau=tau)
     current, score = log_prob.detach(), score.detach()
     log_weights = lifted_log_weights(score, current, tau=0.0, tau_prime=tau)
-    weights = self_normalised_weights(log_weights, sample_dim=sample_dim, mask=mask)
-    uniform = _uniform_weights(log_prob, sample_dim, mask)
+    where: _Where = {"sample_dim": sample_dim, "mask": mask}
+    weights = self_normalised_weights(log_weights, **where)
+    uniform = uniform_weights(log_prob, **where)
     # A masked sample has weight 0 in both, so the quotient's denominator may be anything there.
     signal = score + tau * weights / uniform.clamp_min(_tiny(uniform))
-    return Surrogate(_policy_gradient(log_prob, signal, uniform, sample_dim, mask), weights)
+    return Surrogate(score_function_loss(log_prob, centred(signal, **where), **where), weights)
 
 
 def ment_surrogate(
@@ -501,8 +513,6 @@ def ment_surrogate(
         log_prob: ``[E*, K]``, log-probability of each sample under the policy being trained.
         score: ``[E*, K]``.
         tau: temperature of the entropy; 0 is plain REINFORCE.
-        sample_dim: the axis of the K samples.
-        mask: ``[E*, K]``, True where a sample is real.
 
     Returns:
         :class:`Surrogate`: its weights are uniform.
@@ -511,14 +521,15 @@ def ment_surrogate(
         S = (1 + 0.5 * 1, 0 + 0.5 * 1), so S - mean = +-1/2 and the gradient -+1/4:
 
         >>> log_prob = torch.tensor([-1.0, -1.0], requires_grad=True)
-        >>> loss, weights = ment_surrogate(log_prob, torch.tensor([1.0, 0.0]), tau=0.5)
+        >>> loss, weights, *_ = ment_surrogate(log_prob, torch.tensor([1.0, 0.0]), tau=0.5)
         >>> loss.backward(); log_prob.grad
         tensor([-0.2500,  0.2500])
     """
     check_temperatures(tau=tau, allow_zero=True)
-    uniform = _uniform_weights(log_prob, sample_dim, mask)
+    where: _Where = {"sample_dim": sample_dim, "mask": mask}
     signal = score - tau * log_prob.detach()
-    return Surrogate(_policy_gradient(log_prob, signal, uniform, sample_dim, mask), uniform)
+    loss = score_function_loss(log_prob, centred(signal, **where), **where)
+    return Surrogate(loss, uniform_weights(log_prob, **where))
 
 
 # -------------------------------------------------------------------------------- soft values
@@ -542,10 +553,6 @@ def soft_value(
     Args:
         score: ``[E*, K]``, of each of the K actions there are.
         reference_log_prob: ``[E*, K]``, under the reference policy.
-        tau: temperature of the divergence from the reference.
-        tau_prime: temperature of the entropy.
-        sample_dim: the axis of the K actions.
-        mask: ``[E*, K]``, True where an action is allowed.
 
     Returns:
         ``[E*]``, in the unit of the score, the maximum of
@@ -587,10 +594,6 @@ def soft_value_estimate(
     Args:
         score: ``[E*, M]``.
         reference_log_prob: ``[E*, M]``, under the reference policy, which drew the samples.
-        tau: temperature of the divergence from the reference.
-        tau_prime: temperature of the entropy.
-        sample_dim: the axis of the M samples.
-        mask: ``[E*, M]``, True where a sample is real.
 
     Returns:
         ``[E*]``, in the unit of the score.
@@ -627,10 +630,6 @@ def surrogate_reward(
     Args:
         score: ``[E*, K]``, return of each of the K trajectories there are.
         log_prob: ``[E*, K]``, under pi; may carry a gradient.
-        tau: temperature of the divergence from the reference.
-        tau_prime: temperature of the entropy.
-        sample_dim: the axis of the K trajectories.
-        mask: ``[E*, K]``, True where a trajectory exists.
 
     Returns:
         ``[E*]``, in the unit of the return; from E r + tau' H(pi) (tau to infinity) to max r (both
@@ -670,10 +669,6 @@ def surrogate_reward_estimate(
     Args:
         score: ``[E*, K]``, return of each sampled trajectory.
         log_prob: ``[E*, K]``, under pi, which drew them.
-        tau: temperature of the divergence from the reference.
-        tau_prime: temperature of the entropy.
-        sample_dim: the axis of the K trajectories.
-        mask: ``[E*, K]``, True where a trajectory is real.
 
     Returns:
         ``[E*]``, in the unit of the return.
@@ -726,38 +721,130 @@ def theorem1_temperatures(horizon: float, num_trajectories: int) -> tuple[float,
 # -------------------------------------------------------------------------------- masked algebra
 
 
-def _policy_gradient(
-    log_prob: Tensor, signal: Tensor, uniform: Tensor, sample_dim: int, mask: Tensor | None
-) -> Tensor:
-    """Score-function surrogate of ``signal``, centred by its mean over the group."""
-    signal = _representable(signal.detach())
-    centred = signal - _weighted_sum(uniform, signal, sample_dim, mask, keepdim=True)
-    return -_weighted_sum(uniform * centred, log_prob, sample_dim, mask)
+def uniform_weights(like: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None) -> Tensor:
+    """1/K for each of the K real samples of a group, 0 for the others.
+
+    Args:
+        like: ``[E*, K]``, whose shape, dtype and device the weights get.
+
+    Returns:
+        ``[E*, K]``.
+
+    Examples:
+        >>> uniform_weights(torch.rand(3), mask=torch.tensor([True, True, False]))
+        tensor([0.5000, 0.5000, 0.0000])
+    """
+    if mask is None:
+        return torch.full_like(like, 1 / like.shape[sample_dim])
+    return self_normalised_weights(torch.zeros_like(like), sample_dim=sample_dim, mask=mask)
 
 
-def _weighted_sum(
-    weights: Tensor, values: Tensor, dim: int, mask: Tensor | None, *, keepdim: bool = False
+def weighted_sum(
+    weights: Tensor,
+    values: Tensor,
+    *,
+    sample_dim: int = -1,
+    mask: Tensor | None = None,
+    keepdim: bool = False,
 ) -> Tensor:
-    """Sum of weights times values over real samples, whatever stands in the masked ones."""
+    """Sum of weights times values over the real samples, whatever stands in the masked ones.
+
+    Args:
+        weights: ``[E*, K]``; clipped where the sum would overflow, so that a gradient is left.
+        values: ``[E*, K]``; may carry a gradient.
+        keepdim: whether the sample axis stays, with length 1.
+
+    Returns:
+        ``[E*]``.
+
+    Examples:
+        >>> weights, values = torch.tensor([0.5, 0.5, 0.5]), torch.tensor([1.0, 3.0, math.nan])
+        >>> weighted_sum(weights, values, mask=torch.tensor([True, True, False]))
+        tensor(2.)
+    """
     if mask is not None:
         weights, values = weights.where(mask, 0.0), values.where(mask, 0.0)
     # The constant is clipped, not the product, so that an overflow leaves a gradient.
-    limit = torch.finfo(values.dtype).max / values.shape[dim] / values.detach().abs().clamp_min(1.0)
-    return (weights.clamp(-limit, limit) * values).sum(dim, keepdim=keepdim)
+    largest = torch.finfo(values.dtype).max / values.shape[sample_dim]
+    limit = largest / values.detach().abs().clamp_min(1.0)
+    return (weights.clamp(-limit, limit) * values).sum(sample_dim, keepdim=keepdim)
 
 
-def _uniform_weights(like: Tensor, dim: int, mask: Tensor | None) -> Tensor:
-    """1/K for each of the K real samples, 0 for the others."""
-    if mask is None:
-        return torch.full_like(like, 1 / like.shape[dim])
-    return self_normalised_weights(torch.zeros_like(like), sample_dim=dim, mask=mask)
+def centred(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None) -> Tensor:
+    """Scores less the mean of their group: REINFORCE's advantage with the group as baseline.
+
+    Args:
+        score: ``[E*, K]``.
+
+    Returns:
+        ``[E*, K]``, detached; 0 where masked.
+
+    Examples:
+        >>> centred(torch.tensor([1.0, 2.0, 9.0]), mask=torch.tensor([True, True, False]))
+        tensor([-0.5000,  0.5000,  0.0000])
+    """
+    score = _representable(score.detach())
+    uniform = uniform_weights(score, sample_dim=sample_dim, mask=mask)
+    mean = weighted_sum(uniform, score, sample_dim=sample_dim, mask=mask, keepdim=True)
+    return score - mean if mask is None else (score - mean).where(mask, 0.0)
+
+
+def standardised(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None) -> Tensor:
+    r"""Centred scores in units of their group's standard deviation: GRPO's advantage.
+
+    .. math:: A_k = \frac{r_k - \bar r}{\sqrt{\frac1K \sum_j (r_j - \bar r)^2}}
+
+    Args:
+        score: ``[E*, K]``.
+
+    Returns:
+        ``[E*, K]``, detached; 0 where masked, and in a group of equal scores (equal up to
+        rounding: their spread is below the precision of the largest).
+
+    Examples:
+        >>> standardised(torch.tensor([[0.0, 2.0], [5.0, 5.0]]))
+        tensor([[-1.,  1.],
+                [ 0.,  0.]])
+    """
+    where: _Where = {"sample_dim": sample_dim, "mask": mask}
+    distance = centred(score, **where)
+    # Scaled by the largest distance, so that no square under- or overflows.
+    largest = distance.abs().amax(sample_dim, keepdim=True)
+    size = score.detach().abs() if mask is None else score.detach().abs().where(mask, 0.0)
+    is_spread = largest > torch.finfo(distance.dtype).eps * size.amax(sample_dim, keepdim=True)
+    unit = distance / largest.where(is_spread, 1.0)
+    variance = weighted_sum(uniform_weights(unit, **where), unit.square(), **where, keepdim=True)
+    return (unit / variance.where(is_spread, 1.0).sqrt()).where(is_spread, 0.0)
+
+
+def score_function_loss(
+    log_prob: Tensor, advantage: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None
+) -> Tensor:
+    r"""The loss whose gradient is the score-function estimator's (REINFORCE).
+
+    .. math:: L(\theta) = -\frac1K \sum_k A_k \log \pi_\theta(\rho_k)
+
+    Args:
+        log_prob: ``[E*, K]``, log-probability of each sample under the policy being trained.
+        advantage: ``[E*, K]``, held constant: :func:`centred` or :func:`standardised` scores.
+
+    Returns:
+        ``[E*]``.
+
+    Examples:
+        >>> log_prob = torch.tensor([-1.0, -2.0], requires_grad=True)
+        >>> score_function_loss(log_prob, torch.tensor([0.5, -0.5])).backward(); log_prob.grad
+        tensor([-0.2500,  0.2500])
+    """
+    uniform = uniform_weights(log_prob, sample_dim=sample_dim, mask=mask)
+    return -weighted_sum(uniform * advantage.detach(), log_prob, sample_dim=sample_dim, mask=mask)
 
 
 def _log_uniform(like: Tensor, dim: int, mask: Tensor | None) -> Tensor | float:
-    """Logarithm of :func:`_uniform_weights`; that of 0 is very low."""
+    """Logarithm of :func:`uniform_weights`; that of 0 is very low."""
     if mask is None:
         return -math.log(like.shape[dim])
-    return _uniform_weights(like, dim, mask).clamp_min(_tiny(like)).log()
+    return uniform_weights(like, sample_dim=dim, mask=mask).clamp_min(_tiny(like)).log()
 
 
 def _masked_logsumexp(values: Tensor, dim: int, mask: Tensor | None) -> Tensor:

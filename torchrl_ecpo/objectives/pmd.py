@@ -80,7 +80,7 @@ class PMDLoss(LiftProjectLoss):
 
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
         """Eq. 3 in the unit of the return: the projection's gradient times tau + tau'."""
-        loss, weights = mode_seeking_projection(
+        loss, weights, *_ = mode_seeking_projection(
             groups.log_prob,
             groups.reference_log_prob,
             self.lift(groups),

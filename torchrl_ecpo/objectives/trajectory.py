@@ -159,7 +159,7 @@ class TrajectoryGroupLoss(PolicyLoss):
             or one number a group (``[*G]``) with ``reduction="none"``.
         """
         groups = self._read(tensordict)
-        loss, weights = self.surrogate(groups)
+        loss, weights, *_ = self.surrogate(groups)
         diagnostics = _diagnostics(groups, weights)
         if self.reduction == "none":
             batch_size = loss.shape
