@@ -61,7 +61,7 @@ def test_every_loss_trains_on_the_bandit(sweep, loss):
     assert (run / "curve.png").exists()
     # Trajectories 1 to 30 and 31 to 60 are of one reference each: right after a lift the policy
     # is the reference, then it moves away.
-    kl = metrics["kl_to_reference"]
+    kl = metrics["kl_reference_policy"]
     assert kl[0] == kl[3] == 0
     assert all(kl[i] != 0 for i in (1, 2, 4, 5))
 
@@ -85,7 +85,7 @@ def test_seeds_are_other_problems_and_schedules_and_ablations_are_options(sweep,
     assert scheduled["expected_reward"][0] != read_metrics(sweep / "ecpo")["expected_reward"][0]
     assert scheduled["tau_prime"] == pytest.approx([0.5, 0.375, 0.25, 0.125, 0, 0])
     assert set(without_entropy["tau_prime"]) == {0}
-    assert set(without_entropy["kl_to_reference"]) == {0}, "one step a lift: no projection"
+    assert set(without_entropy["kl_reference_policy"]) == {0}, "one step a lift: no projection"
 
 
 def test_a_sweep_over_two_processes_gives_the_metrics_of_single_runs(sweep, tmp_path):

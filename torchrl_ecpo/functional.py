@@ -39,7 +39,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import NamedTuple, TypedDict
 
 import torch
@@ -53,6 +52,7 @@ __all__ = [
     "effective_sample_size",
     "lift_divergence_estimate",
     "lifted_log_weights",
+    "masked_mean",
     "mean_seeking_projection",
     "ment_surrogate",
     "mode_seeking_projection",
@@ -81,9 +81,9 @@ class Surrogate(NamedTuple):
     """``[E*]``: differentiate with respect to the parameters behind ``log_prob``."""
     weights: Tensor | None
     """``[E*, K]``, detached: non-negative, summing to 1 over real samples. None without a lift."""
-    losses: Mapping[str, Tensor] = MappingProxyType({})
+    losses: Mapping[str, Tensor] = {}  # a mappingproxy, which cannot be written, breaks the graph
     """Further losses by their full names (``"loss_eta"``), ``[E*]`` or 0-d."""
-    metrics: Mapping[str, Tensor] = MappingProxyType({})
+    metrics: Mapping[str, Tensor] = {}
     """Further metrics by name (``"clip_fraction"``), ``[E*]`` or 0-d."""
 
 
@@ -770,6 +770,26 @@ def weighted_sum(
     return (weights.clamp(-limit, limit) * values).sum(sample_dim, keepdim=keepdim)
 
 
+def masked_mean(
+    values: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None, keepdim: bool = False
+) -> Tensor:
+    """Mean over the real samples of a group, whatever stands in the masked ones.
+
+    Args:
+        values: ``[E*, K]``; may carry a gradient.
+        keepdim: whether the sample axis stays, with length 1.
+
+    Returns:
+        ``[E*]``; 0 for a group without a real sample.
+
+    Examples:
+        >>> masked_mean(torch.tensor([1.0, 3.0, math.nan]), mask=torch.tensor([True, True, False]))
+        tensor(2.)
+    """
+    where: _Where = {"sample_dim": sample_dim, "mask": mask}
+    return weighted_sum(uniform_weights(values, **where), values, **where, keepdim=keepdim)
+
+
 def centred(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None) -> Tensor:
     """Scores less the mean of their group: REINFORCE's advantage with the group as baseline.
 
@@ -784,9 +804,8 @@ def centred(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None) 
         tensor([-0.5000,  0.5000,  0.0000])
     """
     score = _representable(score.detach())
-    uniform = uniform_weights(score, sample_dim=sample_dim, mask=mask)
-    mean = weighted_sum(uniform, score, sample_dim=sample_dim, mask=mask, keepdim=True)
-    return score - mean if mask is None else (score - mean).where(mask, 0.0)
+    distance = score - masked_mean(score, sample_dim=sample_dim, mask=mask, keepdim=True)
+    return distance if mask is None else distance.where(mask, 0.0)
 
 
 def standardised(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None) -> Tensor:
@@ -813,7 +832,7 @@ def standardised(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = N
     size = score.detach().abs() if mask is None else score.detach().abs().where(mask, 0.0)
     is_spread = largest > torch.finfo(distance.dtype).eps * size.amax(sample_dim, keepdim=True)
     unit = distance / largest.where(is_spread, 1.0)
-    variance = weighted_sum(uniform_weights(unit, **where), unit.square(), **where, keepdim=True)
+    variance = masked_mean(unit.square(), **where, keepdim=True)
     return (unit / variance.where(is_spread, 1.0).sqrt()).where(is_spread, 0.0)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from torchrl.objectives import LossModule
 
+from torchrl_ecpo._torchrl import schedulable_buffers
 from torchrl_ecpo.functional import theorem1_temperatures
 
 __all__ = [
@@ -154,12 +155,12 @@ class TemperatureScheduler:
     """
 
     def __init__(self, loss_module: LossModule, **schedules: Schedule) -> None:
-        known = sorted(type(loss_module)._all_schedulable_buffers)
+        known = getattr(loss_module, "temperature_names", None) or schedulable_buffers(loss_module)
         for name in schedules:
             if name not in known:
                 raise ValueError(
                     f"{type(loss_module).__name__} has no temperature {name!r} to schedule; "
-                    f"it has {known}."
+                    f"it has {list(known)}."
                 )
         self.loss_module = loss_module
         self.schedules = schedules

@@ -40,7 +40,7 @@ OUT_KEYS = [
     "loss_actor",
     "ESS",
     "max_weight",
-    "kl_to_reference",
+    "kl_reference_policy",
     "entropy",
     "return",
     "equal_return_groups",
@@ -364,7 +364,7 @@ def test_temperatures_travel_with_a_compiled_or_moved_module(case):
     loss = case.build(make_actor())
     assert set(case.temperatures) <= set(dict(loss.named_buffers()))
     assert not set(case.temperatures) & set(dict(loss.named_parameters()))
-    assert type(loss)._schedulable_buffers == frozenset(case.temperatures)
+    assert loss.temperature_names == tuple(case.temperatures)
 
 
 # ------------------------------------------------------------------------------------- the targets

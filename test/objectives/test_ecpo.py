@@ -114,5 +114,5 @@ def test_defaults():
     loss = ECPOLoss(make_actor())
     assert_close(loss.tau, torch.tensor(0.5))
     assert_close(loss.tau_prime, torch.tensor(0.01))
-    assert (loss.length_normalised, loss.control_variate, loss.delay_actor) == (False,) * 3
+    assert (loss.control_variate, loss.delay_actor) == (False, False)
     assert loss.reduction == "mean"

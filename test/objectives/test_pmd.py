@@ -50,7 +50,7 @@ def test_large_tau_pulls_back_to_the_reference():
     before = loss(batch)
     before["loss_actor"].backward()
     torch.optim.SGD(loss.parameters(), lr=1e-3).step()
-    assert loss(batch)["kl_to_reference"] < before["kl_to_reference"]
+    assert loss(batch)["kl_reference_policy"] < before["kl_reference_policy"]
 
 
 def test_defaults():
@@ -58,4 +58,4 @@ def test_defaults():
     loss = PMDLoss(make_actor())
     assert_close(loss.tau, torch.tensor(0.5))
     assert_close(loss.tau_prime, torch.tensor(0.0))
-    assert (loss.length_normalised, loss.delay_actor, loss.reduction) == (False, False, "mean")
+    assert (loss.delay_actor, loss.reduction) == (False, "mean")

@@ -13,6 +13,7 @@ from torchrl_ecpo.objectives.pmd import PMDLoss
 from torchrl_ecpo.objectives.pmd_ac import DiscretePMDACLoss, PMDACLoss
 from torchrl_ecpo.objectives.trajectory import (
     LiftProjectLoss,
+    Steps,
     TrajectoryGroupLoss,
     TrajectoryGroups,
 )
@@ -31,6 +32,7 @@ __all__ = [
     "MENTLoss",
     "PMDACLoss",
     "PMDLoss",
+    "Steps",
     "TrajectoryGroupLoss",
     "TrajectoryGroups",
     "UREXLoss",

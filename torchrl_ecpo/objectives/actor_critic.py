@@ -228,6 +228,7 @@ class ActorCriticLoss(PolicyLoss):
                     f'target_entropy must be finite, in nats, "auto" or None, got {target_entropy}.'
                 )
         temperatures = self._as_temperatures({"tau": tau, "tau_prime": tau_prime})
+        self.temperature_names = tuple(temperatures)
         if target_kl is not None:
             target_kl = as_float("target_kl", target_kl)
             if not 0 < target_kl < math.inf:

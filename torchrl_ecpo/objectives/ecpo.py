@@ -36,7 +36,6 @@ class ECPOLoss(LiftProjectLoss):
             tau_prime / (tau + tau_prime). Defaults to 0.01, where the runs on the same tasks
             start; anneal it towards 0 where the task asks for a deterministic policy. 0 is the
             paper's ablation.
-        length_normalised: if True, the entropy term is per step. Defaults to False (the paper).
         control_variate: if True, the self-normalised ratios pi_theta/pi_bar are subtracted from
             the weights, which removes the drift of groups without a preference. Defaults to False
             (the paper).
@@ -83,7 +82,6 @@ class ECPOLoss(LiftProjectLoss):
         *,
         tau: float = 0.5,
         tau_prime: float = 0.01,
-        length_normalised: bool = False,
         control_variate: bool = False,
         delay_actor: bool = False,
         reduction: Literal["none", "mean", "sum"] | None = None,
@@ -92,7 +90,6 @@ class ECPOLoss(LiftProjectLoss):
             actor_network,
             tau=tau,
             tau_prime=tau_prime,
-            length_normalised=length_normalised,
             delay_actor=delay_actor,
             reduction=reduction,
         )

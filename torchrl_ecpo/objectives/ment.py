@@ -53,9 +53,6 @@ class MENTLoss(TrajectoryGroupLoss):
         (torch.Size([3]), tensor([4., 4., 4.]))
     """
 
-    _schedulable_buffers = frozenset({"tau"})
-    _may_be_zero = True
-
     tau: Tensor
 
     def __init__(
@@ -65,7 +62,9 @@ class MENTLoss(TrajectoryGroupLoss):
         tau: float = 0.01,
         reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
-        super().__init__(actor_network, temperatures={"tau": tau}, reduction=reduction)
+        super().__init__(
+            actor_network, temperatures={"tau": tau}, allow_zero=True, reduction=reduction
+        )
 
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
         """REINFORCE on the return less tau log pi."""

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
-from tensordict.nn import ProbabilisticTensorDictSequential
-
 from torchrl_ecpo.functional import Surrogate, mode_seeking_projection
 from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, TrajectoryGroups
 
@@ -33,7 +29,6 @@ class PMDLoss(LiftProjectLoss):
         tau: temperature of the divergence from the reference policy, in the unit of the return.
             Defaults to 0.5, as :class:`ECPOLoss`.
         tau_prime: temperature of the entropy. Defaults to 0 (the paper's PMD).
-        length_normalised: if True, the entropy term is per step. Defaults to False (the paper).
         delay_actor: if True, the reference policy is the loss's own delayed copy of the actor, see
             :class:`TrajectoryGroupLoss`. Defaults to False: the recorded log-probability is the
             reference's, as in Algorithm 1.
@@ -59,32 +54,13 @@ class PMDLoss(LiftProjectLoss):
         >>> loss["loss_actor"].backward()
     """
 
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        *,
-        tau: float = 0.5,
-        tau_prime: float = 0.0,
-        length_normalised: bool = False,
-        delay_actor: bool = False,
-        reduction: Literal["none", "mean", "sum"] | None = None,
-    ) -> None:
-        super().__init__(
-            actor_network,
-            tau=tau,
-            tau_prime=tau_prime,
-            length_normalised=length_normalised,
-            delay_actor=delay_actor,
-            reduction=reduction,
-        )
-
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
         """Eq. 3 in the unit of the return: the projection's gradient times tau + tau'."""
-        loss, weights, *_ = mode_seeking_projection(
+        projection = mode_seeking_projection(
             groups.log_prob,
             groups.reference_log_prob,
             self.lift(groups),
             behaviour_log_prob=groups.behaviour_log_prob,
             mask=groups.mask,
         )
-        return Surrogate((self.tau + self.tau_prime) * loss, weights)
+        return projection._replace(loss=(self.tau + self.tau_prime) * projection.loss)

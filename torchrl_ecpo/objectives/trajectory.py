@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams, is_tensor_collection
@@ -20,30 +20,38 @@ from tensordict.nn import (
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_ecpo.checks import get_entry, values_can_be_seen
+from torchrl_ecpo.checks import check_group_size, check_padding, get_entry, values_can_be_seen
 from torchrl_ecpo.functional import (
     Surrogate,
     effective_sample_size,
     lifted_log_weights,
     self_normalised_weights,
+    uniform_weights,
 )
 from torchrl_ecpo.objectives._base import PolicyLoss
 
-__all__ = ["LiftProjectLoss", "TrajectoryGroupLoss", "TrajectoryGroups"]
+__all__ = ["LiftProjectLoss", "Steps", "TrajectoryGroupLoss", "TrajectoryGroups"]
 
-OUT_KEYS = (
-    "loss_actor",
-    "ESS",
-    "max_weight",
-    "kl_to_reference",
-    "entropy",
-    "return",
-    "equal_return_groups",
-)
+OF_WEIGHTS = ("ESS", "max_weight")
+OF_GROUPS = ("kl_reference_policy", "entropy", "return", "equal_return_groups")
+
+
+class Steps(NamedTuple):
+    """The steps of the trajectories: every field is ``[*G, K, T]``, 0 in padded steps."""
+
+    rewards: Tensor
+    log_prob: Tensor
+    """log pi_theta(a_t | s_t), under the policy being trained; carries the gradient."""
+    reference_log_prob: Tensor
+    """log pi_bar(a_t | s_t), under the reference policy."""
+    behaviour_log_prob: Tensor
+    """log beta(a_t | s_t), under the policy that drew the trajectories."""
+    mask: Tensor | None
+    """True where the step is real; None where all are."""
 
 
 class TrajectoryGroups(NamedTuple):
-    """Groups of K trajectories as numbers, one for each trajectory: every field is ``[*G, K]``."""
+    """Groups of K trajectories: sums over the real steps, ``[*G, K]``, and the steps themselves."""
 
     returns: Tensor
     """The return r(rho), the sum of the rewards."""
@@ -53,10 +61,17 @@ class TrajectoryGroups(NamedTuple):
     """log pi_bar(rho), under the reference policy."""
     behaviour_log_prob: Tensor
     """log beta(rho), under the policy that drew the trajectories."""
-    num_steps: Tensor
-    """Number of real steps, in the dtype of the returns."""
     mask: Tensor | None
     """True where the trajectory has a real step; None where all have."""
+    steps: Steps
+    """What was summed, for losses of single steps."""
+
+    @property
+    def num_steps(self) -> Tensor:
+        """Number of real steps ``[*G, K]``, in the dtype of the returns."""
+        if self.steps.mask is None:
+            return torch.full_like(self.returns, self.steps.rewards.shape[-1])
+        return self.steps.mask.sum(-1, dtype=self.returns.dtype)
 
 
 class TrajectoryGroupLoss(PolicyLoss):
@@ -65,7 +80,8 @@ class TrajectoryGroupLoss(PolicyLoss):
     It reads a batch ``[*G, K, T]`` (any number of group dimensions, also none), sums rewards and
     log-probabilities over the real steps of each trajectory, hands the numbers to
     :meth:`surrogate`, and reduces and reports what comes back. A new member of the family
-    implements that one method.
+    implements that one method, and declares in :attr:`losses` and :attr:`metrics` what else it
+    returns.
 
     Returns, log-probabilities and what follows from them are in single precision at least, also
     where the actor is in half precision or under autocast.
@@ -85,7 +101,9 @@ class TrajectoryGroupLoss(PolicyLoss):
 
     Keyword Args:
         temperatures: initial values by name; each becomes a buffer that is scheduled by assignment
-            (``loss.tau = 0.1``). In the unit of the return.
+            (``loss.tau = 0.1``) and by :class:`~torchrl_ecpo.TemperatureScheduler`. In the unit of
+            the return.
+        allow_zero: whether all temperatures may be 0 together. Defaults to False.
         delay_actor: if True, the loss keeps ``target_actor_network_params`` as reference policy, to
             be moved by an updater (:mod:`torchrl_ecpo.updaters`), and corrects for the policy that
             drew the trajectories where its log-probability is recorded. If False (default, and
@@ -101,6 +119,27 @@ class TrajectoryGroupLoss(PolicyLoss):
             without a real step gives 0.)
         TypeError: if ``actor_network`` has no ``get_dist``.
         KeyError: when called, for a missing entry.
+
+    Examples:
+        A member in a few lines, REINFORCE with the mean of the other trajectories as baseline:
+
+        >>> from torchrl_ecpo.functional import centred, score_function_loss
+        >>> class RLOOLoss(TrajectoryGroupLoss):
+        ...     metrics = ("advantage",)
+        ...     def surrogate(self, groups):
+        ...         K = groups.returns.shape[-1]
+        ...         advantage = centred(groups.returns) * K / (K - 1)
+        ...         loss = score_function_loss(groups.log_prob, advantage)
+        ...         return Surrogate(loss, None, metrics={"advantage": advantage.abs().mean(-1)})
+    """
+
+    losses: ClassVar[tuple[str, ...]] = ()
+    """Names of the further losses that :meth:`surrogate` returns; each begins with ``loss_``."""
+    metrics: ClassVar[tuple[str, ...]] = OF_WEIGHTS
+    """Names of the metrics that are the member's own.
+
+    ``"ESS"`` and ``"max_weight"``, the default, are computed from the weights that
+    :meth:`surrogate` returns. A member without weights declares its own metrics only, or none.
     """
 
     @dataclass
@@ -132,20 +171,35 @@ class TrajectoryGroupLoss(PolicyLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         *,
-        temperatures: dict[str, float],
+        temperatures: Mapping[str, float] | None = None,
+        allow_zero: bool = False,
         delay_actor: bool = False,
         reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
-        super().__init__(actor_network, delay_actor=delay_actor, reduction=reduction)
-        self.out_keys = list(OUT_KEYS)
-        for name, value in self._as_temperatures(temperatures).items():
-            self.register_coeff_buffer(name, value)
+        super().__init__(
+            actor_network,
+            temperatures=temperatures,
+            allow_zero=allow_zero,
+            delay_actor=delay_actor,
+            reduction=reduction,
+        )
+        for name in self.losses:
+            if not name.startswith("loss_"):
+                raise ValueError(f"The name of a loss begins with 'loss_', got {name!r}.")
+        repeated = [name for name in self._all_out_keys if self._all_out_keys.count(name) > 1]
+        if repeated:
+            raise ValueError(f"Names of every loss, or declared twice: {sorted(set(repeated))}.")
+        self.out_keys = self._all_out_keys
 
     # ------------------------------------------------------------------------------- one method
 
     @abstractmethod
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
-        """The loss of each group ``[*G]``, and the weights it gave the trajectories ``[*G, K]``."""
+        """The loss of each group ``[*G]``, and the weights it gave the trajectories ``[*G, K]``.
+
+        Without a lift the weights are None. Further losses and metrics, ``[*G]`` or 0-d, have the
+        names that :attr:`losses` and :attr:`metrics` declare.
+        """
 
     @dispatch  # pyright: ignore[reportArgumentType] - it is typed for its other use, with arguments
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -159,19 +213,35 @@ class TrajectoryGroupLoss(PolicyLoss):
             or one number a group (``[*G]``) with ``reduction="none"``.
         """
         groups = self._read(tensordict)
-        loss, weights, *_ = self.surrogate(groups)
-        diagnostics = _diagnostics(groups, weights)
-        if self.reduction == "none":
-            batch_size = loss.shape
+        surrogate = self.surrogate(groups)
+        losses = {"loss_actor": surrogate.loss, **surrogate.losses}
+        metrics = {**surrogate.metrics, **_of_weights(surrogate.weights), **_of_groups(groups)}
+        self._check_declared(surrogate)
+        dtype, reduction = surrogate.loss.dtype, self.reduction
+        shape = surrogate.loss.shape if reduction == "none" else torch.Size([])
+        metrics = {name: value.detach().to(dtype) for name, value in metrics.items()}
+        if reduction == "none":
+            outputs: dict[Any, Tensor] = {k: v.expand(shape) for k, v in (losses | metrics).items()}
         else:
-            batch_size = torch.Size([])
-            diagnostics = {name: value.mean() for name, value in diagnostics.items()}
-        outputs = {"loss_actor": self._reduce_loss(loss), **diagnostics}
-        td_out = TensorDict(outputs, batch_size=batch_size).select(*self.out_keys)
-        self._clear_weakrefs(
-            tensordict, td_out, "actor_network_params", "target_actor_network_params"
-        )
-        return td_out
+            reduce = torch.sum if reduction == "sum" else torch.mean
+            outputs = {name: reduce(loss) for name, loss in losses.items()}
+            outputs |= {name: value.mean() for name, value in metrics.items()}
+        return TensorDict({key: outputs[key] for key in self.out_keys}, batch_size=shape)
+
+    def _check_declared(self, surrogate: Surrogate) -> None:
+        """Refuse further losses and metrics of other names than those in :attr:`out_keys`."""
+        from_weights = () if surrogate.weights is None else OF_WEIGHTS
+        for kind, returned in (
+            ("losses", {*surrogate.losses}),
+            ("metrics", {*surrogate.metrics, *from_weights}),
+        ):
+            declared = {*getattr(self, kind)}
+            if returned - declared - {*from_weights} or declared - returned:
+                raise ValueError(
+                    f"{type(self).__name__} declares the {kind} {sorted(declared)}, but its "
+                    f"surrogate returned {sorted(returned)}: both must be the same, as out_keys is "
+                    "known before the first call. (ESS and max_weight come from the weights.)"
+                )
 
     # ------------------------------------------------------------------------------------- keys
 
@@ -185,7 +255,7 @@ class TrajectoryGroupLoss(PolicyLoss):
             *_as_list(self.tensor_keys.action),
             self._reward_key,
             *_as_list(self.tensor_keys.sample_log_prob),
-            *self._loss_mask_keys()[:1],
+            *self.mask_keys[:1],
         ]
         return list(dict.fromkeys(keys))
 
@@ -193,9 +263,14 @@ class TrajectoryGroupLoss(PolicyLoss):
     def in_keys(self, keys: Sequence[NestedKey]) -> None:
         self._in_keys = list(keys)
 
-    def _set_in_keys(self) -> None:
-        """Called by ``set_keys``: keys that were given are the old ones."""
+    def set_keys(self, **kwargs: Any) -> None:
+        """Rename entries of the input, see :class:`_AcceptedKeys`; None is the default name."""
+        super().set_keys(**kwargs)
         self._in_keys = None
+
+    @property
+    def _all_out_keys(self) -> list[Any]:
+        return ["loss_actor", *self.losses, *self.metrics, *OF_GROUPS]
 
     def select_out_keys(self, *out_keys: str) -> TrajectoryGroupLoss:
         """Return these entries only, until :meth:`reset_out_keys`.
@@ -206,53 +281,64 @@ class TrajectoryGroupLoss(PolicyLoss):
         Raises:
             ValueError: for a key that is not among the :attr:`out_keys`.
         """
-        unknown = [key for key in out_keys if key not in OUT_KEYS]
-        if unknown or not out_keys:
-            raise ValueError(f"Select some of the out_keys {list(OUT_KEYS)}, got {list(out_keys)}.")
+        known = self._all_out_keys
+        if not out_keys or not {*out_keys} <= {*known}:
+            raise ValueError(f"Select some of the out_keys {known}, got {list(out_keys)}.")
         self.out_keys = list(out_keys)
         return self
 
     def reset_out_keys(self) -> TrajectoryGroupLoss:
         """Undo :meth:`select_out_keys`."""
-        self.out_keys = list(OUT_KEYS)
+        self.out_keys = self._all_out_keys
         return self
 
     # ---------------------------------------------------------------------------------- reading
 
     def _read(self, tensordict: TensorDictBase) -> TrajectoryGroups:
         """Sum rewards and log-probabilities over the real steps of each trajectory."""
-        reward = get_entry(tensordict, self._reward_key)
-        shape = _batch_shape(reward, self._reward_key)
-        step_mask = self._mask(tensordict, shape)
-        if step_mask is not None and values_can_be_seen():
-            _check_padding(step_mask, self._loss_mask_keys())
-
-        def over_steps(values: Tensor) -> Tensor:
-            # A sum over a completion of 1,000 tokens would be off by nats in half precision, and
-            # returns that differ by little would be equal.
-            values = values.to(torch.promote_types(values.dtype, torch.float32))
-            return (values if step_mask is None else values.where(step_mask, 0.0)).sum(-1)
-
-        recorded = self._recorded_log_prob(tensordict, shape)
-        inputs = self._actor_inputs(tensordict, shape, step_mask)
-        log_prob = over_steps(self._log_prob(inputs, self.actor_network_params, shape))
-        if self.delay_actor:
-            with torch.no_grad():
-                params = self.target_actor_network_params
-                reference = over_steps(self._log_prob(inputs, params, shape))
-            behaviour = reference if recorded is None else over_steps(recorded)
-        else:
-            reference = behaviour = over_steps(self._demanded(recorded))
+        steps = self._read_steps(tensordict)
+        reference = steps.reference_log_prob.sum(-1)
+        is_reference = steps.behaviour_log_prob is steps.reference_log_prob
         groups = TrajectoryGroups(
-            returns=over_steps(reward.squeeze(-1).to(log_prob.dtype)),
-            log_prob=log_prob,
+            returns=steps.rewards.sum(-1),
+            log_prob=steps.log_prob.sum(-1),
             reference_log_prob=reference,
-            behaviour_log_prob=behaviour,
-            num_steps=over_steps(torch.ones_like(reward.squeeze(-1), dtype=log_prob.dtype)),
-            mask=None if step_mask is None else step_mask.any(-1),
+            behaviour_log_prob=reference if is_reference else steps.behaviour_log_prob.sum(-1),
+            mask=None if steps.mask is None else steps.mask.any(-1),
+            steps=steps,
         )
         self._check_values(groups)
         return groups
+
+    def _read_steps(self, tensordict: TensorDictBase) -> Steps:
+        reward = get_entry(tensordict, self._reward_key)
+        shape = _batch_shape(reward, self._reward_key)
+        mask = self._mask(tensordict, shape)
+        if mask is not None and values_can_be_seen():
+            check_padding(self.mask_keys, mask)
+
+        def real(values: Tensor) -> Tensor:
+            # A sum over a completion of 1,000 tokens would be off by nats in half precision, and
+            # returns that differ by little would be equal.
+            values = values.to(torch.promote_types(values.dtype, torch.float32))
+            return values if mask is None else values.where(mask, 0.0)
+
+        recorded = self._recorded_log_prob(tensordict, shape)
+        inputs = self._actor_inputs(tensordict, shape, mask)
+        log_prob = real(self._log_prob(inputs, self.actor_network_params, shape))
+        if self.delay_actor:
+            with torch.no_grad():
+                reference = real(self._log_prob(inputs, self.target_actor_network_params, shape))
+            behaviour = reference if recorded is None else real(recorded)
+        else:
+            reference = behaviour = real(self._demanded(recorded))
+        return Steps(
+            rewards=real(reward.squeeze(-1).to(log_prob.dtype)),
+            log_prob=log_prob,
+            reference_log_prob=reference,
+            behaviour_log_prob=behaviour,
+            mask=mask,
+        )
 
     def _actor_inputs(
         self, tensordict: TensorDictBase, shape: torch.Size, step_mask: Tensor | None
@@ -279,7 +365,7 @@ class TrajectoryGroupLoss(PolicyLoss):
         if step_mask is not None:
             step_mask = step_mask.reshape(-1, shape[-1])
             inputs = inputs[_last_real_step(step_mask)]
-            inputs.set(self._loss_mask_keys()[0], step_mask)
+            inputs.set(self.mask_keys[0], step_mask)
         return inputs
 
     def _log_prob(
@@ -392,7 +478,7 @@ class TrajectoryGroupLoss(PolicyLoss):
             return
         if not bool(is_group.all().item()):
             raise ValueError(
-                f"The mask ({self._loss_mask_keys()}) leaves {int((~is_group).sum())} group(s) "
+                f"The mask ({self.mask_keys}) leaves {int((~is_group).sum())} group(s) "
                 "with fewer than two trajectories that have a real step: weights are relative to "
                 "the other trajectories of the group. Drop such groups before calling the loss."
             )
@@ -411,15 +497,11 @@ class LiftProjectLoss(TrajectoryGroupLoss):
 
     Keyword Args:
         tau: temperature of the divergence from the reference policy, in the unit of the return.
-        tau_prime: temperature of the entropy, in the unit of the return.
-        length_normalised: if True, the entropy term of the lift is per step: log pi_bar(rho) is
-            divided by the number of steps, so that long trajectories are not favoured for being
-            improbable. Not in the paper; off by default.
+            Defaults to 0.5, the middle of the values searched on the algorithmic tasks.
+        tau_prime: temperature of the entropy, in the unit of the return. Defaults to 0.
         delay_actor: see :class:`TrajectoryGroupLoss`.
         reduction: see :class:`TrajectoryGroupLoss`.
     """
-
-    _schedulable_buffers = frozenset({"tau", "tau_prime"})
 
     tau: Tensor
     tau_prime: Tensor
@@ -428,9 +510,8 @@ class LiftProjectLoss(TrajectoryGroupLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         *,
-        tau: float,
-        tau_prime: float,
-        length_normalised: bool = False,
+        tau: float = 0.5,
+        tau_prime: float = 0.0,
         delay_actor: bool = False,
         reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
@@ -440,14 +521,12 @@ class LiftProjectLoss(TrajectoryGroupLoss):
             delay_actor=delay_actor,
             reduction=reduction,
         )
-        self.length_normalised = length_normalised
 
     def lift(self, groups: TrajectoryGroups) -> Tensor:
         """Log-weight ``[*G, K]`` of the lifted policy relative to the reference: Eq. 5."""
-        reference = groups.reference_log_prob
-        if self.length_normalised:
-            reference = reference / groups.num_steps.clamp_min(1)
-        return lifted_log_weights(groups.returns, reference, tau=self.tau, tau_prime=self.tau_prime)
+        return lifted_log_weights(
+            groups.returns, groups.reference_log_prob, tau=self.tau, tau_prime=self.tau_prime
+        )
 
 
 # ------------------------------------------------------------------------------------- small parts
@@ -482,23 +561,8 @@ def _batch_shape(reward: Tensor, key: NestedKey) -> torch.Size:
         raise ValueError(
             f"The batch is empty: the reward {key!r} has the shape {tuple(reward.shape)}."
         )
-    if reward.shape[-3] < 2:
-        raise ValueError(
-            f"A group must have K >= 2 trajectories, got a batch [*G, K, T] = "
-            f"{tuple(reward.shape[:-1])} with K = {reward.shape[-3]}: weights are relative to the "
-            "other trajectories of the group."
-        )
+    check_group_size(reward.shape[-3], f"K of the batch [*G, K, T] = {tuple(reward.shape[:-1])}")
     return reward.shape[:-1]
-
-
-def _check_padding(step_mask: Tensor, keys: Sequence[NestedKey]) -> None:
-    """Refuse holes: a policy with memory would read other histories than those it acted on."""
-    holes = (step_mask[..., 1:] & ~step_mask[..., :-1]).any(-1)
-    if holes.any():
-        raise ValueError(
-            f"The mask {tuple(keys)} has holes in {int(holes.sum())} trajectories: their real "
-            "steps must come first, and the padding after them."
-        )
 
 
 def _last_real_step(step_mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -514,27 +578,30 @@ def _last_real_step(step_mask: Tensor) -> tuple[Tensor, Tensor]:
     return rows.unsqueeze(-1).expand_as(columns), columns[rows]
 
 
-def _diagnostics(groups: TrajectoryGroups, weights: Tensor) -> dict[str, Tensor]:
-    """What to watch, ``[*G]`` each, without gradient.
+def _of_weights(weights: Tensor | None) -> dict[str, Tensor]:
+    """How evenly a lift weighs the trajectories, ``[*G]`` each."""
+    if weights is None:
+        return {}
+    return {"ESS": effective_sample_size(weights), "max_weight": weights.amax(-1)}
+
+
+def _of_groups(groups: TrajectoryGroups) -> dict[str, Tensor]:
+    """What to watch, ``[*G]`` each.
 
     KL(reference, policy) and the entropy of the policy are estimates from K trajectories, so the
     former may come out below 0.
     """
     mask = groups.mask
-    log_prob = groups.log_prob.detach()
+    log_prob, returns = groups.log_prob.detach(), groups.returns.detach()
     log_ratio = groups.reference_log_prob - groups.behaviour_log_prob
     of_reference = self_normalised_weights(log_ratio, mask=mask)
     of_policy = self_normalised_weights(log_prob - groups.behaviour_log_prob, mask=mask)
-    uniform = self_normalised_weights(torch.zeros_like(log_prob), mask=mask)
-    returns = groups.returns.detach()
-    real = torch.ones_like(returns, dtype=torch.bool) if mask is None else mask
-    highest = returns.where(real, -torch.inf).amax(-1)
-    lowest = returns.where(real, torch.inf).amin(-1)
+    highest = returns if mask is None else returns.where(mask, -torch.inf)
+    lowest = returns if mask is None else returns.where(mask, torch.inf)
+    is_equal = highest.amax(-1) == lowest.amin(-1)
     return {
-        "ESS": effective_sample_size(weights),
-        "max_weight": weights.amax(-1),
-        "kl_to_reference": (of_reference * (groups.reference_log_prob - log_prob)).sum(-1),
+        "kl_reference_policy": (of_reference * (groups.reference_log_prob - log_prob)).sum(-1),
         "entropy": -(of_policy * log_prob).sum(-1),
-        "return": (uniform * returns).sum(-1),
-        "equal_return_groups": (highest == lowest).to(returns.dtype),
+        "return": (uniform_weights(returns, mask=mask) * returns).sum(-1),
+        "equal_return_groups": is_equal.to(returns.dtype),
     }

@@ -51,8 +51,6 @@ class UREXLoss(TrajectoryGroupLoss):
         >>> loss["loss_actor"].backward()
     """
 
-    _schedulable_buffers = frozenset({"tau"})
-
     tau: Tensor
 
     def __init__(

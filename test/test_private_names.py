@@ -1,0 +1,124 @@
+"""Private names of other packages stand in one file for each, and are there."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from torchrl_ecpo import _torch, _torchrl
+
+ROOT = Path(__file__).parents[1]
+SOURCES = [
+    path
+    for folder in ("torchrl_ecpo", "sota-implementations")
+    for path in sorted((ROOT / folder).rglob("*.py"))
+]
+FOR_PRIVATE_NAMES = {"torchrl_ecpo/_torch.py", "torchrl_ecpo/_torchrl.py"}
+EXTENSION_POINTS = {
+    # Documented as what a subclass has to define or may override.
+    "_AcceptedKeys",
+    "_call",
+    "_forward_value_estimator_keys",
+    "_reset",
+    "_schedulable_buffers",
+    "_set_seed",
+    "_step",
+    # Of NamedTuple, whose public methods begin with an underscore.
+    "_asdict",
+    "_fields",
+    "_replace",
+}
+STILL_TO_CLEAN = {
+    "sota-implementations/ecac/score_sac.py",
+    "sota-implementations/ecac/utils.py",
+    "torchrl_ecpo/collectors/groups.py",
+    "torchrl_ecpo/collectors/supervised.py",
+    "torchrl_ecpo/envs/replay.py",
+    "torchrl_ecpo/experiment/compiling.py",
+    "torchrl_ecpo/groups.py",
+    "torchrl_ecpo/modules/actor_critic.py",
+    "torchrl_ecpo/modules/tuple_policy.py",
+    "torchrl_ecpo/objectives/actor_critic.py",
+    "torchrl_ecpo/updaters.py",
+}
+
+
+@pytest.mark.parametrize("module", [_torch, _torchrl], ids=lambda module: module.__name__)
+def test_every_private_name_is_there(module):
+    for owner, name in module.PRIVATE_NAMES:
+        package = str(getattr(owner, "__module__", None) or owner.__name__).partition(".")[0]
+        assert hasattr(owner, name), (
+            f"{package} {version(package)} has no {name!r} in {owner!r} any more. "
+            f"{Path(module.__file__).name} says what it was needed for: mend it there."
+        )
+
+
+def is_private(name: str) -> bool:
+    return name.startswith("_") and not name.endswith("__") and name != "_"
+
+
+def is_assigned_to_self(node: ast.Attribute) -> bool:
+    return isinstance(node.ctx, ast.Store) and ast.unparse(node.value) == "self"
+
+
+def defined_names(tree: ast.AST) -> Iterator[str]:
+    """Functions, classes, variables and attributes that a source defines."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.AsyncFunctionDef):
+            yield node.name
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.id
+        elif isinstance(node, ast.Attribute) and is_assigned_to_self(node):
+            yield node.attr
+
+
+TREES = {str(path.relative_to(ROOT)): ast.parse(path.read_text()) for path in SOURCES}
+OURS = {name for tree in TREES.values() for name in defined_names(tree)}
+
+
+def is_foreign(node: ast.ImportFrom) -> bool:
+    return node.level == 0 and not str(node.module).startswith("torchrl_ecpo")
+
+
+def foreign_private_names(tree: ast.AST, ours: set[str]) -> list[str]:
+    """Uses of private names that no source of ours defines, as ``line: name``."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and is_private(node.attr):
+            if node.attr not in ours | EXTENSION_POINTS:
+                found.append(f"{node.lineno}: {node.attr}")
+        elif isinstance(node, ast.ImportFrom) and is_foreign(node):
+            names = [alias.name for alias in node.names]
+            modules = str(node.module).split(".")
+            found += [f"{node.lineno}: {name}" for name in [*modules, *names] if is_private(name)]
+    return found
+
+
+@pytest.mark.parametrize("path", TREES)
+def test_private_names_of_others_stand_in_one_file(path):
+    found = foreign_private_names(TREES[path], OURS)
+    if path in FOR_PRIVATE_NAMES:
+        return
+    if path in STILL_TO_CLEAN:
+        assert found, f"{path} is clean: take it off STILL_TO_CLEAN"
+        return
+    assert not found, f"{path} uses private names of other packages: {found}"
+
+
+def test_a_private_name_of_others_is_found():
+    source = """
+from torchrl.objectives.utils import _vmap_func
+from torchrl_ecpo.objectives._base import PolicyLoss
+
+class Loss(PolicyLoss):
+    def _own(self):
+        self._also_own = self._own()
+        return self._reduce_loss(self._also_own), batch.writer._rng
+"""
+    tree = ast.parse(source)
+    found = foreign_private_names(tree, set(defined_names(tree)))
+    assert sorted(found) == ["2: _vmap_func", "8: _reduce_loss", "8: _rng"]
