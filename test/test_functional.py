@@ -16,22 +16,28 @@ from torch.testing import assert_close
 
 from torchrl_ecpo.functional import (
     Surrogate,
+    centred,
     centred_gaussian_projection,
     check_temperatures,
     effective_sample_size,
     lift_divergence_estimate,
     lifted_log_weights,
+    masked_mean,
     mean_seeking_projection,
     ment_surrogate,
     mode_seeking_projection,
+    score_function_loss,
     self_normalised_weights,
     soft_value,
     soft_value_estimate,
+    standardised,
     surrogate_reward,
     surrogate_reward_estimate,
     temperature_dual,
     theorem1_temperatures,
+    uniform_weights,
     urex_surrogate,
+    weighted_sum,
 )
 
 DTYPES = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
@@ -692,15 +698,6 @@ def test_leading_shapes_and_sample_dim(name, shape, masked):
         assert_close(tuple(y.movedim(dim, -1) for y in moved.per_sample), expected.per_sample)
 
 
-@pytest.mark.parametrize("dim", [-3, -2, 0, 1, 2])
-def test_effective_sample_size_and_weights_take_the_sample_dim(dim):
-    log_weights = random_samples(2, 3, 4).score
-    weights = self_normalised_weights(log_weights)
-    moved = self_normalised_weights(log_weights.movedim(-1, dim), sample_dim=dim)
-    assert_close(moved.movedim(dim, -1), weights)
-    assert_close(effective_sample_size(moved, sample_dim=dim), effective_sample_size(weights))
-
-
 @DTYPES
 @every_function
 @pytest.mark.parametrize("masked", [False, True])
@@ -773,6 +770,93 @@ def test_the_largest_numbers_never_give_nan(name, dtype, masked):
             assert_close(per_sample[0].sum().item(), 1.0)
 
 
+# ----------------------------------------------------------------------------- the masked algebra
+
+
+MASKED = torch.tensor([True, True, False])
+ALGEBRA = {
+    "uniform_weights": (lambda x, **where: uniform_weights(x, **where), (0.5, 0.5, 0.0)),
+    "weighted_sum": (lambda x, **where: weighted_sum(x, x, **where), 10.0),
+    "masked_mean": (masked_mean, 2.0),
+    "centred": (centred, (-1.0, 1.0, 0.0)),
+    "standardised": (standardised, (-1.0, 1.0, 0.0)),
+    "score_function_loss": (lambda x, **where: score_function_loss(x, x, **where), -5.0),
+    "lift_divergence_estimate": (
+        lambda x, **where: lift_divergence_estimate(self_normalised_weights(x, **where), **where),
+        None,
+    ),
+    "effective_sample_size": (
+        lambda x, mask=None, sample_dim=-1: effective_sample_size(
+            self_normalised_weights(x, mask=mask, sample_dim=sample_dim), sample_dim=sample_dim
+        ),
+        None,
+    ),
+}
+algebra = pytest.mark.parametrize("name", ALGEBRA)
+
+
+@DTYPES
+@algebra
+def test_masked_algebra_by_hand(name, dtype):
+    """Of 1 and 3, beside a masked sample; whatever stands there, it counts for nothing."""
+    function, expected = ALGEBRA[name]
+    for junk in (7.0, math.nan, math.inf, -math.inf):
+        actual = function(vector(1, 3, junk, dtype=dtype), mask=MASKED)
+        alone = function(vector(1, 3, dtype=dtype))
+        assert_close(actual if actual.ndim == 0 else actual[:2], alone)
+        if expected is not None:
+            assert_close(actual, torch.tensor(expected, dtype=dtype))
+
+
+@algebra
+def test_effective_sample_size_and_weights_take_the_sample_dim(name):
+    """And so do all: groups are independent, wherever the axis of their samples stands."""
+    function, _ = ALGEBRA[name]
+    x, mask = random_samples(2, 3, 4).score, random_samples(2, 3, 4, seed=1).score > -0.5
+    mask[..., :2] = True
+    for real in (None, mask):
+        expected = function(x, mask=real)
+        for g in itertools.product(range(2), range(3)):
+            one = function(x[g], mask=None if real is None else real[g])
+            assert_close(one, expected[g])
+        for dim in (-3, -2, 0, 1, 2):
+            moved = function(
+                x.movedim(-1, dim),
+                sample_dim=dim,
+                mask=None if real is None else real.movedim(-1, dim),
+            )
+            assert_close(moved if moved.ndim == 2 else moved.movedim(dim, -1), expected)
+
+
+@DTYPES
+@pytest.mark.parametrize("constant", [0.0, 0.1, -3.0, 1e4, 1e30])
+def test_standardised_scores_of_equal_samples_are_zero(dtype, constant):
+    """Equal up to rounding is equal: their spread is noise, and would be blown up to 1."""
+    score = torch.full((3, 7), constant, dtype=dtype)
+    assert (standardised(score) == 0).all()
+    score[1, 0] *= 1 + torch.finfo(dtype).eps
+    score[2, 3:] = math.nan
+    mask = torch.arange(7) < 3
+    assert (standardised(score, mask=mask.expand(3, 7)) == 0).all()
+
+
+@PROPERTY
+@given(x=groups(k=5), scale=st.sampled_from([1e-30, 1e-3, 1.0, 1e30]), shift=st.floats(-9, 9))
+def test_standardised_scores_have_mean_zero_and_deviation_one(x, scale, shift):
+    score = x.score + torch.arange(5.0)
+    actual = standardised(scale * (score + shift))
+    assert_close(actual, (score - score.mean()) / score.std(correction=0), atol=1e-6, rtol=1e-6)
+
+
+def test_scores_are_held_constant_and_the_log_probability_is_not():
+    score, log_prob = random_samples(2, 4).score.requires_grad_(), random_samples(2, 4).log_prob
+    assert not centred(score).requires_grad
+    assert not standardised(score).requires_grad
+    assert not score_function_loss(log_prob, score).requires_grad
+    expected = -score.detach() / 4
+    assert_close(gradient(lambda x: score_function_loss(x, score), log_prob), expected)
+
+
 # ------------------------------------------------------------- the lift's divergence, temperatures
 
 
@@ -814,13 +898,6 @@ def test_lift_divergence_estimate_is_exact_on_an_exact_sample(counts, tau, tau_p
     target = case.lifted(tau, tau_prime)
     expected = (target.exp() * (target - case.reference)).sum()
     assert_close(lift_divergence_estimate(weights), expected)
-
-
-@pytest.mark.parametrize("dim", [-3, -1, 0, 1])
-def test_lift_divergence_estimate_takes_the_sample_dim(dim):
-    weights = self_normalised_weights(random_samples(2, 3, 4).score)
-    moved = lift_divergence_estimate(weights.movedim(-1, dim), sample_dim=dim)
-    assert_close(moved, lift_divergence_estimate(weights))
 
 
 @DTYPES

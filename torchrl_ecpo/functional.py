@@ -818,7 +818,7 @@ def standardised(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = N
 
     Returns:
         ``[E*, K]``, detached; 0 where masked, and in a group of equal scores (equal up to
-        rounding: their spread is below the precision of the largest).
+        rounding: within 8 units in the last place of the largest).
 
     Examples:
         >>> standardised(torch.tensor([[0.0, 2.0], [5.0, 5.0]]))
@@ -827,13 +827,16 @@ def standardised(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = N
     """
     where: _Where = {"sample_dim": sample_dim, "mask": mask}
     distance = centred(score, **where)
+    real = torch.ones_like(distance, dtype=torch.bool) if mask is None else mask
+    highest = score.detach().where(real, -math.inf).amax(sample_dim, keepdim=True)
+    lowest = score.detach().where(real, math.inf).amin(sample_dim, keepdim=True)
+    rounding = 8 * torch.finfo(distance.dtype).eps * torch.maximum(highest.abs(), lowest.abs())
+    is_spread = highest - lowest > rounding
     # Scaled by the largest distance, so that no square under- or overflows.
-    largest = distance.abs().amax(sample_dim, keepdim=True)
-    size = score.detach().abs() if mask is None else score.detach().abs().where(mask, 0.0)
-    is_spread = largest > torch.finfo(distance.dtype).eps * size.amax(sample_dim, keepdim=True)
-    unit = distance / largest.where(is_spread, 1.0)
-    variance = masked_mean(unit.square(), **where, keepdim=True)
-    return (unit / variance.where(is_spread, 1.0).sqrt()).where(is_spread, 0.0)
+    largest = distance.abs().amax(sample_dim, keepdim=True).where(is_spread, 1.0)
+    unit = distance / largest
+    variance = masked_mean(unit.square(), **where, keepdim=True).where(is_spread, 1.0)
+    return (unit / variance.sqrt()).where(is_spread, 0.0)
 
 
 def score_function_loss(

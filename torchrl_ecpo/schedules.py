@@ -131,7 +131,7 @@ class TemperatureScheduler:
     """Writes scheduled temperatures into a loss.
 
     Args:
-        loss_module: a loss whose temperatures are schedulable buffers, as all of this package are.
+        loss_module: a loss of this package, or one of TorchRL's with schedulable buffers.
         schedules: by temperature, for example ``tau_prime=linear(0.02, 0.0, 800)``. Their values
             at 0 are written at once.
 
@@ -141,13 +141,9 @@ class TemperatureScheduler:
 
     Examples:
         >>> import torch
-        >>> from torchrl.objectives import LossModule
-        >>> class Loss(LossModule):
-        ...     _schedulable_buffers = frozenset({"tau_prime"})
-        ...     def __init__(self):
-        ...         super().__init__()
-        ...         self.register_coeff_buffer("tau_prime", 1.0)
-        >>> loss_module = Loss()
+        >>> from torchrl_ecpo import ECPOLoss
+        >>> from torchrl_ecpo.modules import make_softmax_policy
+        >>> loss_module = ECPOLoss(make_softmax_policy(torch.eye(4)))
         >>> temperatures = TemperatureScheduler(loss_module, tau_prime=linear(0.02, 0.0, 100))
         >>> temperatures.step(50)
         >>> loss_module.tau_prime

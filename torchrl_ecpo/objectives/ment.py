@@ -35,20 +35,12 @@ class MENTLoss(TrajectoryGroupLoss):
     Examples:
         The batch is that of :class:`ECPOLoss`, and so is the call without a tensordict.
 
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from tensordict.nn import TensorDictModule
-        >>> from torch.distributions import Categorical
-        >>> from torchrl.modules import ProbabilisticActor
-        >>> network = TensorDictModule(torch.nn.Linear(2, 6), ["observation"], ["logits"])
-        >>> actor = ProbabilisticActor(network, in_keys=["logits"], distribution_class=Categorical)
+        >>> from torchrl_ecpo.envs import BanditEnv
+        >>> from torchrl_ecpo.modules import make_softmax_policy
+        >>> env = BanditEnv(num_actions=6, num_groups=3, group_size=4)
+        >>> actor = make_softmax_policy(env.features)
         >>> loss_module = MENTLoss(actor, tau=0.01, reduction="none")
-        >>> loss = loss_module(TensorDict({
-        ...     "observation": torch.randn(3, 4, 5, 2),
-        ...     "action": torch.randint(6, (3, 4, 5)),
-        ...     "action_log_prob": torch.full((3, 4, 5), -1.8),
-        ...     "next": {"reward": torch.rand(3, 4, 5, 1)},
-        ... }, batch_size=[3, 4, 5]))
+        >>> loss = loss_module(env.rollout(1, actor))  # 3 groups of 4 trajectories of 1 step
         >>> loss["loss_actor"].shape, loss["ESS"]  # all weights are equal
         (torch.Size([3]), tensor([4., 4., 4.]))
     """

@@ -29,28 +29,18 @@ class PMDLoss(LiftProjectLoss):
         tau: temperature of the divergence from the reference policy, in the unit of the return.
             Defaults to 0.5, as :class:`ECPOLoss`.
         tau_prime: temperature of the entropy. Defaults to 0 (the paper's PMD).
-        delay_actor: if True, the reference policy is the loss's own delayed copy of the actor, see
-            :class:`TrajectoryGroupLoss`. Defaults to False: the recorded log-probability is the
-            reference's, as in Algorithm 1.
+        delay_actor: see :class:`ECPOLoss`. Defaults to False.
         reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
     Examples:
         The batch is that of :class:`ECPOLoss`, and so is the call without a tensordict.
 
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from tensordict.nn import TensorDictModule
-        >>> from torch.distributions import Categorical
-        >>> from torchrl.modules import ProbabilisticActor
-        >>> network = TensorDictModule(torch.nn.Linear(2, 6), ["observation"], ["logits"])
-        >>> actor = ProbabilisticActor(network, in_keys=["logits"], distribution_class=Categorical)
+        >>> from torchrl_ecpo.envs import BanditEnv
+        >>> from torchrl_ecpo.modules import make_softmax_policy
+        >>> env = BanditEnv(num_actions=6, num_groups=3, group_size=4)
+        >>> actor = make_softmax_policy(env.features)
         >>> loss_module = PMDLoss(actor, tau=0.5)
-        >>> loss = loss_module(TensorDict({
-        ...     "observation": torch.randn(4, 5, 2),  # one group of 4 trajectories of 5 steps
-        ...     "action": torch.randint(6, (4, 5)),
-        ...     "action_log_prob": torch.full((4, 5), -1.8),
-        ...     "next": {"reward": torch.rand(4, 5, 1)},
-        ... }, batch_size=[4, 5]))
+        >>> loss = loss_module(env.rollout(1, actor))  # 3 groups of 4 trajectories of 1 step
         >>> loss["loss_actor"].backward()
     """
 
