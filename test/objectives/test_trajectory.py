@@ -38,6 +38,8 @@ from torchrl_ecpo.updaters import PeriodicCopy, PolyakAverage
 
 SHAPES = [(3, 4), (2, 3, 4), (2, 2, 3, 4)]
 losses = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+# What stands once in the base class is asked of one member.
+base = pytest.mark.parametrize("case", [CASES["ecpo"]], ids=["ecpo"])
 lifting = pytest.mark.parametrize("case", [CASES[n] for n in LIFTING], ids=LIFTING)
 actors = pytest.mark.parametrize("kind", ACTORS)
 
@@ -89,7 +91,7 @@ def test_group_shapes_and_missing_trajectories(case, shape, masked):
     assert loss(batch)["loss_actor"].shape == shape[:-2]
 
 
-@losses
+@base
 def test_missing_first_trajectory_of_a_recurrent_actor(case):
     """The steps that a trajectory without any borrows do not disturb the others."""
     actor = make_actor("lstm")
@@ -165,7 +167,7 @@ def test_extreme_returns_stay_finite(case, dtype):
     assert all(g.isfinite().all() for g in gradients(out["loss_actor"], actor))
 
 
-@losses
+@base
 def test_recurrent_memory_is_that_of_the_rollout(case):
     """One pass over a trajectory gives the log-probability that was recorded step by step."""
     for kind in ("lstm", "gru"):
@@ -174,7 +176,7 @@ def test_recurrent_memory_is_that_of_the_rollout(case):
         assert_close(out["kl_reference_policy"], torch.zeros_like(out["kl_reference_policy"]))
 
 
-@losses
+@base
 def test_rows_of_several_episodes(case):
     """is_init inside a row resets the memory: the actor is called as TorchRL's losses call it."""
     actor = make_actor("gru")
@@ -188,7 +190,7 @@ def test_rows_of_several_episodes(case):
 # ------------------------------------------------------------------------------------------- masks
 
 
-@losses
+@base
 def test_own_mask_key(case):
     """loss_mask_key names the entry, with or without a trailing dimension; others are ignored."""
     actor = make_actor()
@@ -203,7 +205,7 @@ def test_own_mask_key(case):
         assert_close(loss(batch), expected)
 
 
-@losses
+@base
 def test_mask_key_that_is_not_there(case):
     """A mistyped key must not make padding count."""
     loss = case.build(make_actor())
@@ -212,7 +214,7 @@ def test_mask_key_that_is_not_there(case):
         loss(sample(make_actor(), 2, 3, 4))
 
 
-@losses
+@base
 def test_parts_of_an_action_must_all_be_named(case):
     actor = make_actor("part_by_part")
     loss = case.build(actor)
@@ -245,7 +247,7 @@ def test_vmap(case):
     assert_close(torch.vmap(lambda batch: loss(batch)["loss_actor"])(batches), expected)
 
 
-@losses
+@base
 def test_no_mask_key(case):
     """loss_mask_key None: all steps count, whatever ("collector", "mask") says."""
     actor = make_actor()
@@ -257,7 +259,7 @@ def test_no_mask_key(case):
     assert_close(loss(batch.clone().set(MASK, torch.zeros(2, 3, 4, dtype=torch.bool))), expected)
 
 
-@losses
+@base
 def test_mask_key_is_an_in_key(case):
     """Whenever the mask is named, a call without a tensordict takes it as a keyword."""
     loss = case.build(make_actor())
@@ -538,7 +540,7 @@ def test_reduction(case, shape):
 # ----------------------------------------------------------------------- what a batch may look like
 
 
-@losses
+@base
 def test_a_batch_size_of_any_depth(case):
     """The shape is that of the rewards; a replay buffer may give a batch of fewer dimensions."""
     actor = make_actor()
@@ -551,7 +553,7 @@ def test_a_batch_size_of_any_depth(case):
         assert shallow.batch_dims == dims
 
 
-@losses
+@base
 def test_lazily_stacked_and_locked_batches(case):
     """What collectors and buffers hand out."""
     actor = make_actor()
@@ -563,7 +565,7 @@ def test_lazily_stacked_and_locked_batches(case):
     assert_close(loss(batch.clone().lock_()), expected)
 
 
-@losses
+@base
 def test_a_nested_action(case):
     """A multi-agent style action key, and a composite action read as one nested entry."""
     actor = make_actor("composite")
@@ -575,7 +577,7 @@ def test_a_nested_action(case):
     assert_close(loss(batch), expected)
 
 
-@losses
+@base
 def test_a_list_of_one_key(case):
     """A list is a list, also where the action has one part only."""
     actor = make_actor()
@@ -743,7 +745,7 @@ BAD_BATCHES = {
 }
 
 
-@losses
+@base
 @pytest.mark.parametrize("name", BAD_BATCHES)
 def test_bad_batch(case, name):
     """Each mistake is named, with what was expected, what came, and how to mend it."""
@@ -754,7 +756,7 @@ def test_bad_batch(case, name):
         case.build(actor)(batch)
 
 
-@losses
+@base
 def test_actor_with_a_log_prob_of_trailing_dimension(case):
     """A distribution that is not summed over the action's components."""
     network = torch.nn.Sequential(torch.nn.Linear(3, 2), NormalParamExtractor())
@@ -769,7 +771,7 @@ def test_actor_with_a_log_prob_of_trailing_dimension(case):
         case.build(actor)(batch)
 
 
-@losses
+@base
 def test_several_action_keys_for_one_distribution(case):
     """A list of keys belongs to a composite distribution: the others would be left out."""
     actor = make_actor()
@@ -779,14 +781,14 @@ def test_several_action_keys_for_one_distribution(case):
         loss(sample(actor, 2, 3, 4))
 
 
-@losses
+@base
 def test_padded_junk_is_no_bad_input(case):
     """NaN in padded steps is refused by nothing, not even where it is all a trajectory has."""
     actor = make_actor()
     assert case.build(actor)(pad(sample(actor, 2, 3, 4), masked=(2,)))["loss_actor"].isfinite()
 
 
-@losses
+@base
 @pytest.mark.parametrize("reduction", ["bogus", "MEAN", "", 0])
 def test_unknown_reduction(case, reduction):
     """Refused at the door, not at the first call."""
@@ -794,7 +796,7 @@ def test_unknown_reduction(case, reduction):
         case.build(make_actor(), reduction=reduction)
 
 
-@losses
+@base
 def test_actor_without_get_dist(case):
     """A bare network is no policy."""
     with pytest.raises(TypeError, match=r"get_dist.*ProbabilisticActor.*got Linear"):
@@ -876,7 +878,7 @@ def test_a_temperature_of_another_type(name, temperature, value, message):
     assert temperature in dict(loss.named_buffers())
 
 
-@losses
+@base
 @pytest.mark.parametrize("shape", [(0, 4, 5), (3, 4, 0)])
 def test_an_empty_batch(case, shape):
     """No groups, or no steps."""

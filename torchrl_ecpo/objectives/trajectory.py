@@ -214,9 +214,15 @@ class TrajectoryGroupLoss(PolicyLoss):
         """
         groups = self._read(tensordict)
         surrogate = self.surrogate(groups)
+        of_weights = _of_weights(surrogate.weights)
         losses = {"loss_actor": surrogate.loss, **surrogate.losses}
-        metrics = {**surrogate.metrics, **_of_weights(surrogate.weights), **_of_groups(groups)}
-        self._check_declared(surrogate)
+        metrics = {
+            **surrogate.metrics,
+            **{k: v for k, v in of_weights.items() if k in self.metrics},
+        }
+        self._check_declared("losses", self.losses, surrogate.losses)
+        self._check_declared("metrics", self.metrics, metrics)
+        metrics |= _of_groups(groups)
         dtype, reduction = surrogate.loss.dtype, self.reduction
         shape = surrogate.loss.shape if reduction == "none" else torch.Size([])
         metrics = {name: value.detach().to(dtype) for name, value in metrics.items()}
@@ -228,20 +234,16 @@ class TrajectoryGroupLoss(PolicyLoss):
             outputs |= {name: value.mean() for name, value in metrics.items()}
         return TensorDict({key: outputs[key] for key in self.out_keys}, batch_size=shape)
 
-    def _check_declared(self, surrogate: Surrogate) -> None:
-        """Refuse further losses and metrics of other names than those in :attr:`out_keys`."""
-        from_weights = () if surrogate.weights is None else OF_WEIGHTS
-        for kind, returned in (
-            ("losses", {*surrogate.losses}),
-            ("metrics", {*surrogate.metrics, *from_weights}),
-        ):
-            declared = {*getattr(self, kind)}
-            if returned - declared - {*from_weights} or declared - returned:
-                raise ValueError(
-                    f"{type(self).__name__} declares the {kind} {sorted(declared)}, but its "
-                    f"surrogate returned {sorted(returned)}: both must be the same, as out_keys is "
-                    "known before the first call. (ESS and max_weight come from the weights.)"
-                )
+    def _check_declared(
+        self, kind: str, declared: tuple[str, ...], returned: Mapping[str, Tensor]
+    ) -> None:
+        """Refuse other names than those in :attr:`out_keys`, which is known before the call."""
+        if {*declared} != {*returned}:
+            raise ValueError(
+                f"{type(self).__name__} declares the {kind} {sorted(declared)}, but its surrogate "
+                f"returned {sorted(returned)}. Declare what it returns ('ESS' and 'max_weight' are"
+                " computed from weights that are not None)."
+            )
 
     # ------------------------------------------------------------------------------------- keys
 
