@@ -130,6 +130,17 @@ def test_masked_log_prob_is_the_formula() -> None:
         assert_close(dist.log_prob(action), expected)
 
 
+def test_the_mode_weighs_writing_with_its_best_character_against_silence() -> None:
+    dist = random_dist("masked", 500)
+    actions = all_actions("masked")
+    best = actions[dist.log_prob(actions.unsqueeze(1)).argmax(0)]
+    assert_close(dist.mode, best)
+    move, write, character = (part.argmax(-1) for part in dist.logits.split(NVEC, -1))
+    independent = torch.stack([move, write, write * character], -1)
+    wrong = (independent != best).any(-1)
+    assert wrong.sum() > 10, "the argmax of each factor should not do"
+
+
 @pytest.mark.parametrize("head", HEADS)
 def test_distribution_gradients(head: str) -> None:
     logits = random_dist(head, 4).logits.requires_grad_()
