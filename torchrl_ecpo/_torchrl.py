@@ -1,0 +1,19 @@
+"""Private names of TorchRL and tensordict, each with the reason why no public one will do."""
+
+from __future__ import annotations
+
+from torchrl.objectives import LossModule
+
+PRIVATE_NAMES: tuple[tuple[object, str], ...] = (
+    (LossModule(), "_has_update_associated"),  # of each instance
+)
+"""Names used below; ``test/test_private_names.py`` says which one a new version has lost."""
+
+
+def networks_with_updater(loss_module: LossModule) -> dict[str, bool]:
+    """For each network of a loss, whether an updater follows it; true where nothing is delayed.
+
+    An updater marks its networks in this dict, and the loss warns of those that are not marked.
+    TorchRL's own constructor marks all of them, and there is no public name for one.
+    """
+    return loss_module._has_update_associated
