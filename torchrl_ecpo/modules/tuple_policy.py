@@ -59,8 +59,8 @@ class TupleCategorical(Distribution):
         0.25
     """
 
-    arg_constraints = {"logits": constraints.real_vector}  # noqa: RUF012 - torch declares it so
-    support = constraints.independent(constraints.nonnegative_integer, 1)
+    arg_constraints: dict = {"logits": constraints.real_vector}  # noqa: RUF012 - as torch has it
+    support: constraints.Constraint = constraints.independent(constraints.nonnegative_integer, 1)
 
     def __init__(self, logits: Tensor, nvec: Sequence[int], validate_args: bool = True) -> None:
         size = _num_logits(nvec)
