@@ -6,6 +6,7 @@ import ast
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -50,9 +51,11 @@ STILL_TO_CLEAN = {
 @pytest.mark.parametrize("module", [_torch, _torchrl], ids=lambda module: module.__name__)
 def test_every_private_name_is_there(module):
     for owner, name in module.PRIVATE_NAMES:
-        package = str(getattr(owner, "__module__", None) or owner.__name__).partition(".")[0]
+        is_named = isinstance(owner, type | ModuleType)
+        kind = owner if is_named else type(owner)
+        package = str(getattr(kind, "__module__", None) or kind.__name__).partition(".")[0]
         assert hasattr(owner, name), (
-            f"{package} {version(package)} has no {name!r} in {owner!r} any more. "
+            f"{package} {version(package)} has no {name!r} in {kind.__name__} any more. "
             f"{Path(module.__file__).name} says what it was needed for: mend it there."
         )
 

@@ -90,7 +90,7 @@ def slow(*options):
         slow(*BANDIT, "loss=pmd_entropy", "project_steps=4"),
         slow(*BANDIT, "loss=urex"),
         slow(*BANDIT, "loss=ment"),
-        slow(*COPY, "env=reversed_addition", "env.head=joint", "loss=pmd_entropy"),
+        slow(*COPY, "env=reversed_addition", "loss=pmd_entropy"),
     ],
     ids=["bandit", "copy", "pmd", "urex", "ment", "reversed_addition"],
 )

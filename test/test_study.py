@@ -141,6 +141,12 @@ def test_the_study_is_what_was_planned(study):
         assert number >= methods[task, "ECPO"], f"{method} has fewer settings than ECPO on {task}"
 
 
+def test_an_option_that_is_gone_makes_no_other_run_unless_it_had_another_value(study):
+    changed = study.manifest.changed_entries
+    assert changed({"env.head": "masked", "tau": 1}, {"tau": 1}) == []
+    assert changed({"env.head": "joint"}, {}) == ["env.head was joint, is masked"]
+
+
 @pytest.mark.slow
 def test_every_task_and_every_setting_of_the_study_composes(study):
     """Each setting on one task, as composing takes long."""

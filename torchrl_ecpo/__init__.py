@@ -1,5 +1,8 @@
 """Lift-and-project policy optimisation for TorchRL: ECPO, PMD, ECAC and their rivals."""
 
+from torchrl_ecpo.collectors import TrajectoryGroupCollector
+from torchrl_ecpo.envs import BanditEnv
+from torchrl_ecpo.modules import make_softmax_policy
 from torchrl_ecpo.objectives import (
     ActorCriticLoss,
     ContinuousActorCriticLoss,
@@ -22,6 +25,7 @@ from torchrl_ecpo.updaters import PeriodicCopy, PolyakAverage, UpdaterSequence
 
 __all__ = [
     "ActorCriticLoss",
+    "BanditEnv",
     "ContinuousActorCriticLoss",
     "DiscreteActorCriticLoss",
     "DiscreteECACLoss",
@@ -36,10 +40,12 @@ __all__ = [
     "PeriodicCopy",
     "PolyakAverage",
     "TemperatureScheduler",
+    "TrajectoryGroupCollector",
     "TrajectoryGroupLoss",
     "TrajectoryGroups",
     "UREXLoss",
     "UpdaterSequence",
+    "make_softmax_policy",
 ]
 
 __version__ = "0.1.0"

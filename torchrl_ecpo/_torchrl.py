@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
-PRIVATE_NAMES: tuple[tuple[object, str], ...] = ((LossModule, "_all_schedulable_buffers"),)
-"""Names used below; ``test/test_private_names.py`` says which one a new version has lost."""
+PRIVATE_NAMES: tuple[tuple[object, str], ...] = (
+    (LossModule, "_all_schedulable_buffers"),
+    (LossModule(), "_has_update_associated"),  # of each instance
+    (EnvBase, "_step_proc_data"),  # overridden by AlgorithmicEnv: saves a tenth of a step
+)
+"""Names used here; ``test/test_private_names.py`` says which one a new version has lost."""
 
 
 def schedulable_buffers(loss_module: LossModule) -> tuple[str, ...]:
@@ -15,3 +20,12 @@ def schedulable_buffers(loss_module: LossModule) -> tuple[str, ...]:
     decides what an assignment does, has no public name.
     """
     return tuple(sorted(type(loss_module)._all_schedulable_buffers))
+
+
+def networks_with_updater(loss_module: LossModule) -> dict[str, bool]:
+    """For each network of a loss, whether an updater follows it; true where nothing is delayed.
+
+    An updater marks its networks in this dict, and the loss warns of those that are not marked.
+    TorchRL's own constructor marks all of them, and there is no public name for one.
+    """
+    return loss_module._has_update_associated

@@ -3,23 +3,42 @@
 A loss keeps *delayed* copies of some of its networks as ``target_<network>_params``: the reference
 policy that ECPO lifts, the value network behind a soft-Q target. TorchRL's
 :class:`~torchrl.objectives.SoftUpdate` and :class:`~torchrl.objectives.HardUpdate` take all of them
-at once; the updaters here take the networks they are given by name, so that one loss can have a
+at once. The updaters here take the networks they are given by name, so that one loss can have a
 reference policy that is replaced every N calls and a value target that is averaged:
 
 >>> import torch
 >>> from tensordict.nn import TensorDictModule
 >>> from torchrl.modules import ValueOperator
 >>> from torchrl.objectives import DDPGLoss
->>> actor = TensorDictModule(
-...     torch.nn.Linear(3, 1), in_keys=["observation"], out_keys=["action"]
+>>> policy = torch.nn.Linear(3, 1)
+>>> critic = torch.nn.Linear(3, 1)
+>>> loss = DDPGLoss(
+...     TensorDictModule(policy, in_keys=["observation"], out_keys=["action"]),
+...     ValueOperator(critic, in_keys=["observation"]),
+...     delay_actor=True,
 ... )
->>> critic = ValueOperator(torch.nn.Linear(3, 1), in_keys=["observation"])
->>> loss = DDPGLoss(actor, critic, delay_actor=True)
+>>> for network in (policy, critic):
+...     _ = torch.nn.init.zeros_(network.bias)
 >>> updater = UpdaterSequence(
-...     PeriodicCopy(loss, "actor_network", interval=100),
-...     PolyakAverage(loss, "value_network", tau=0.005),
+...     PeriodicCopy(loss, "actor_network", interval=2),
+...     PolyakAverage(loss, "value_network", weight=0.25),
 ... )
->>> updater.step()  # once after each optimizer step
+>>> for network in (policy, critic):
+...     _ = torch.nn.init.ones_(network.bias)
+>>> reference = loss.target_actor_network_params["module", "bias"]
+>>> target = loss.target_value_network_params["module", "bias"]
+>>> for _ in range(2):  # once after each optimizer step
+...     updater.step()
+...     print(reference.item(), target.item())
+0.0 0.25
+1.0 0.4375
+>>> updater
+UpdaterSequence(
+    PeriodicCopy(DDPGLoss, 'actor_network', interval=2),
+    PolyakAverage(DDPGLoss, 'value_network', weight=0.25),
+)
+>>> updater.state_dict()
+{'updaters': [{'initialized': True, 'counter': 0}, {'initialized': True}]}
 
 Checkpoints
 -----------
@@ -37,20 +56,23 @@ from typing import Any
 from torch import Tensor
 from torchrl.objectives import LossModule, TargetNetUpdater
 
+from torchrl_ecpo._torchrl import networks_with_updater
+from torchrl_ecpo.checks import check_count
+
 __all__ = ["PeriodicCopy", "PolyakAverage", "UpdaterSequence"]
 
 
 class _NetworkUpdater(TargetNetUpdater):
     """A :class:`~torchrl.objectives.TargetNetUpdater` of the named networks of a loss only.
 
-    A subclass says in ``_step`` what one call does to one tensor. Overridden from TorchRL's class:
-
-    - the constructor, which takes every target of the loss and marks all of them as updated;
-    - ``init_`` and ``step``, which keep their own collection of the tensors that required a
-      gradient when it was built: buffers (the statistics of a normalisation layer), frozen layers
-      and parameters shared with another network would stay behind. Reading the loss at each call
-      leaves out nothing, and there is no collection that could go stale.
+    A subclass says in ``_step`` what one call does to one tensor. TorchRL's constructor takes every
+    target of the loss. Its ``init_`` and ``step`` keep a collection of the tensors that required a
+    gradient when it was built: buffers (the statistics of a normalisation layer), frozen layers and
+    parameters shared with another network would stay behind. Ours read the loss at each call.
     """
+
+    option: str
+    """The name of the subclass's option."""
 
     def __init__(self, loss_module: LossModule, *networks: str) -> None:
         if not isinstance(loss_module, LossModule):
@@ -59,33 +81,24 @@ class _NetworkUpdater(TargetNetUpdater):
             )
         self.loss_module = loss_module
         self.networks = _delayed_networks(loss_module, networks)
-        self._source_names = [f"{name}_params" for name in self.networks]
-        self._target_names = [f"target_{name}_params" for name in self.networks]
-        self.initialized = False
-
-        # The loss warns whenever a target is read that has no updater: our own are marked before
-        # `init_` reads them, and nobody else's, so that a forgotten network is still reported.
-        associated = loss_module._has_update_associated
-        before = dict(associated)
-        associated.update(dict.fromkeys(self.networks, True))
-        try:
+        with warnings.catch_warnings():
+            # A loss warns when a target is read that no updater follows yet.
+            warnings.simplefilter("ignore")
             self.init_()
-        except Exception:
-            associated.update(before)
-            raise
+        networks_with_updater(loss_module).update(dict.fromkeys(self.networks, True))
 
     def init_(self) -> None:
         """Copies the networks into their delayed parameters, now.
 
-        The constructor does this. Call it again whenever the two should start level once more, for
-        instance after ``loss.reset_parameters_recursive()``, which draws different values for a
-        network and for its delayed copy; unlike TorchRL's updaters, this does not warn.
+        The constructor does this. Call it again after ``loss.reset_parameters_recursive()``, which
+        draws different values for a network and for its delayed copy. Unlike that of TorchRL's
+        updaters, a second call does not warn.
 
         Raises:
             RuntimeError: if delayed parameters require a gradient.
         """
         for source, target in self._pairs():
-            target.data.copy_(source.data)
+            target.copy_(source)
         self.initialized = True
 
     def step(self) -> None:
@@ -95,9 +108,15 @@ class _NetworkUpdater(TargetNetUpdater):
             RuntimeError: if the updater is not initialised, or if delayed parameters require a
                 gradient.
         """
-        self._check_initialized()
-        for source, target in self._pairs():
-            self._step(source.data, target.data)
+        if not self.initialized:
+            raise RuntimeError(f"Call {type(self).__name__}.init_() before step().")
+        if self._is_due():
+            for source, target in self._pairs():
+                self._step(source, target)
+
+    def _is_due(self) -> bool:
+        """Whether this call does anything."""
+        return True
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restores the progress that ``state_dict()`` returned.
@@ -114,29 +133,23 @@ class _NetworkUpdater(TargetNetUpdater):
         super().load_state_dict(state_dict)
 
     def _pairs(self) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yields every (network tensor, delayed tensor), buffers included."""
-        for source_name, target_name in zip(self._source_names, self._target_names, strict=True):
-            sources = getattr(self.loss_module, source_name)
-            for key, target in getattr(self.loss_module, target_name).items(True, True):
+        """Yields the data of every (network tensor, delayed tensor), buffers included."""
+        for network in self.networks:
+            delayed = f"target_{network}_params"
+            sources = getattr(self.loss_module, f"{network}_params")
+            for key, target in getattr(self.loss_module, delayed).items(True, True):
                 if target.requires_grad:
                     raise RuntimeError(
-                        f"{target_name} requires a gradient ({key!r}): delayed parameters must "
-                        "stay buffers. Use them through "
+                        f"{delayed} requires a gradient ({key!r}): delayed parameters must stay "
+                        "buffers. Use them through "
                         "`params.to_module(net, preserve_module_state=False)`."
                     )
-                yield sources.get(key), target
-
-    def _check_initialized(self) -> None:
-        if not self.initialized:
-            raise RuntimeError(f"Call {type(self).__name__}.init_() before step().")
-
-    def _extra_repr(self) -> str:
-        raise NotImplementedError
+                yield sources.get(key).data, target.data
 
     def __repr__(self) -> str:
-        networks = ", ".join(map(repr, self.networks))
-        loss = type(self.loss_module).__name__
-        return f"{type(self).__name__}({loss}, {networks}, {self._extra_repr()})"
+        arguments = [type(self.loss_module).__name__, *map(repr, self.networks)]
+        arguments.append(f"{self.option}={getattr(self, self.option)}")
+        return f"{type(self).__name__}({', '.join(arguments)})"
 
 
 class PeriodicCopy(_NetworkUpdater):
@@ -145,7 +158,8 @@ class PeriodicCopy(_NetworkUpdater):
     This is how a reference policy moves from one lift to the next: it stands still for N gradient
     steps while the policy is projected, then becomes the policy. Calls N, 2N, 3N, ... copy, exactly
     (TorchRL's ``HardUpdate(loss, value_network_update_interval=N)`` copies on every (N+1)-th call).
-    Parameters and buffers are copied in place; dtype, device and absence of gradients stay.
+    Parameters and buffers are copied in place; dtype, device and absence of gradients stay. There
+    is an example at the head of :mod:`torchrl_ecpo.updaters`.
 
     Args:
         loss_module: any loss with delayed networks.
@@ -161,70 +175,39 @@ class PeriodicCopy(_NetworkUpdater):
     Raises:
         ValueError: if ``loss_module`` is no LossModule, if a network is unknown, not delayed or
             named twice, or if ``interval`` is not a positive int.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict.nn import TensorDictModule
-        >>> from torchrl.modules import ValueOperator
-        >>> from torchrl.objectives import DDPGLoss
-        >>> actor = TensorDictModule(
-        ...     torch.nn.Linear(3, 1), in_keys=["observation"], out_keys=["action"]
-        ... )
-        >>> critic = ValueOperator(torch.nn.Linear(3, 1), in_keys=["observation"])
-        >>> loss = DDPGLoss(actor, critic, delay_actor=True, delay_value=False)
-        >>> updater = PeriodicCopy(loss, "actor_network", interval=3)
-        >>> updater
-        PeriodicCopy(DDPGLoss, 'actor_network', interval=3)
-        >>> reference = loss.target_actor_network_params
-        >>> _ = torch.nn.init.ones_(actor.module.bias)
-        >>> for call in range(1, 4):
-        ...     updater.step()
-        ...     print(call, (reference["module", "bias"] == actor.module.bias).all().item())
-        1 False
-        2 False
-        3 True
     """
 
+    option = "interval"
+
     def __init__(self, loss_module: LossModule, *networks: str, interval: int) -> None:
-        if not isinstance(interval, int) or isinstance(interval, bool) or interval < 1:
-            raise ValueError(
-                f"interval must be a positive int (the number of calls from one copy to the "
-                f"next), got {interval!r}."
-            )
+        check_count("interval", interval, reason=", the number of calls from one copy to the next")
         self.interval = interval
         self.counter = 0
         super().__init__(loss_module, *networks)
 
     def init_(self) -> None:
-        """Copies the networks into their delayed parameters, now, and counts anew from here."""
+        """Copies the networks into their delayed parameters, now, and counts from 0 again."""
         super().init_()
         self.counter = 0
 
-    def step(self) -> None:
-        """Counts one call; copies on every ``interval``-th.
-
-        Raises:
-            RuntimeError: as for :meth:`init_`, or if the updater is not initialised.
-        """
-        self._check_initialized()
+    def _is_due(self) -> bool:
         self.counter += 1
         # Not "==": a run may be resumed with an interval shorter than the count it was saved with.
-        if self.counter >= self.interval:
-            super().step()
-            self.counter = 0
+        if self.counter < self.interval:
+            return False
+        self.counter = 0
+        return True
 
     def _step(self, p_source: Tensor, p_target: Tensor) -> None:
         p_target.copy_(p_source)
-
-    def _extra_repr(self) -> str:
-        return f"interval={self.interval}"
 
 
 class PolyakAverage(_NetworkUpdater):
     """Moves delayed networks a fraction of the way towards the networks on every call.
 
-    ``delayed <- (1 - tau) * delayed + tau * network``, in place, for parameters and floating point
-    buffers; integer and boolean buffers (a layer's batch counter) are copied.
+    ``delayed <- (1 - weight) * delayed + weight * network``, in place, for parameters and floating
+    point buffers; integer and boolean buffers (a layer's batch counter) are copied. There is an
+    example at the head of :mod:`torchrl_ecpo.updaters`.
 
     Args:
         loss_module: any loss with delayed networks.
@@ -232,51 +215,28 @@ class PolyakAverage(_NetworkUpdater):
             ``"qvalue_network"``. Default: all delayed networks of the loss.
 
     Keyword Args:
-        tau: weight of the network, in (0, 1]; ``1 - eps`` of TorchRL's ``SoftUpdate``. This is not
-            the temperature of the losses. Default: 0.005, the value of TD3 and of SAC's published
-            implementations, and ours for actor-critic runs.
+        weight: of the network in the average, in (0, 1]; TorchRL's ``SoftUpdate`` calls it ``tau``.
+            Default: 0.005, the value of TD3 and of SAC's published implementations, and ours for
+            actor-critic runs.
 
     Raises:
         ValueError: if ``loss_module`` is no LossModule, if a network is unknown, not delayed or
-            named twice, or if ``tau`` is not in (0, 1].
-
-    Examples:
-        >>> import torch
-        >>> from tensordict.nn import TensorDictModule
-        >>> from torchrl.modules import ValueOperator
-        >>> from torchrl.objectives import DDPGLoss
-        >>> actor = TensorDictModule(
-        ...     torch.nn.Linear(3, 1), in_keys=["observation"], out_keys=["action"]
-        ... )
-        >>> critic = ValueOperator(torch.nn.Linear(3, 1), in_keys=["observation"])
-        >>> _ = torch.nn.init.zeros_(critic.module.bias)
-        >>> loss = DDPGLoss(actor, critic)
-        >>> updater = PolyakAverage(loss, "value_network", tau=0.25)
-        >>> _ = torch.nn.init.ones_(critic.module.bias)
-        >>> updater.step()
-        >>> loss.target_value_network_params["module", "bias"].item()
-        0.25
-        >>> updater.step()
-        >>> loss.target_value_network_params["module", "bias"].item()
-        0.4375
+            named twice, or if ``weight`` is not in (0, 1].
     """
 
-    def __init__(self, loss_module: LossModule, *networks: str, tau: float = 0.005) -> None:
-        if not 0 < tau <= 1:
-            raise ValueError(
-                f"tau must be in (0, 1] (the weight of the network in the average), got {tau!r}."
-            )
-        self.tau = tau
+    option = "weight"
+
+    def __init__(self, loss_module: LossModule, *networks: str, weight: float = 0.005) -> None:
+        if not 0 < weight <= 1:
+            raise ValueError(f"weight must be in (0, 1], got {weight!r}.")
+        self.weight = weight
         super().__init__(loss_module, *networks)
 
     def _step(self, p_source: Tensor, p_target: Tensor) -> None:
         if p_target.is_floating_point():
-            p_target.lerp_(p_source, self.tau)
+            p_target.lerp_(p_source, self.weight)
         else:
             p_target.copy_(p_source)
-
-    def _extra_repr(self) -> str:
-        return f"tau={self.tau}"
 
 
 class UpdaterSequence(TargetNetUpdater):
@@ -284,9 +244,9 @@ class UpdaterSequence(TargetNetUpdater):
 
     It is a :class:`~torchrl.objectives.TargetNetUpdater` itself, so it goes wherever TorchRL takes
     one (a trainer's ``target_net_updater``, :class:`~torchrl.trainers.TargetNetUpdaterHook`), and
-    into another sequence. A delayed network of the loss that has no updater at all may be updated
-    by hand, so it is not refused, but a warning names it; TorchRL's own warning then follows at
-    each call of the loss.
+    into another sequence. A delayed network without an updater may be updated by hand, so it is not
+    refused: a warning names it, and TorchRL's own warning follows at each call of the loss. There
+    is an example at the head of :mod:`torchrl_ecpo.updaters`.
 
     Args:
         *updaters: updaters of one and the same loss, no two of which update the same network.
@@ -297,38 +257,14 @@ class UpdaterSequence(TargetNetUpdater):
     Raises:
         ValueError: if there are no updaters, if one of them is no TargetNetUpdater, if they belong
             to different losses, or if two of them update the same network.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict.nn import TensorDictModule
-        >>> from torchrl.modules import ValueOperator
-        >>> from torchrl.objectives import DDPGLoss
-        >>> actor = TensorDictModule(
-        ...     torch.nn.Linear(3, 1), in_keys=["observation"], out_keys=["action"]
-        ... )
-        >>> critic = ValueOperator(torch.nn.Linear(3, 1), in_keys=["observation"])
-        >>> loss = DDPGLoss(actor, critic, delay_actor=True)
-        >>> updater = UpdaterSequence(
-        ...     PeriodicCopy(loss, "actor_network", interval=100),
-        ...     PolyakAverage(loss, "value_network"),
-        ... )
-        >>> updater
-        UpdaterSequence(
-            PeriodicCopy(DDPGLoss, 'actor_network', interval=100),
-            PolyakAverage(DDPGLoss, 'value_network', tau=0.005),
-        )
-        >>> updater.step()
-        >>> updater.state_dict()
-        {'updaters': [{'initialized': True, 'counter': 1}, {'initialized': True}]}
     """
 
     def __init__(self, *updaters: TargetNetUpdater) -> None:
-        _check_composable(updaters)
+        owners = _owners(updaters)
         self.updaters = updaters
+        self.networks = tuple(owners)
         self.loss_module = updaters[0].loss_module
-        self._source_names = [name for updater in updaters for name in updater._source_names]
-        self._target_names = [name for updater in updaters for name in updater._target_names]
-        associated = self.loss_module._has_update_associated
+        associated = networks_with_updater(self.loss_module)
         if forgotten := [name for name, has_updater in associated.items() if not has_updater]:
             warnings.warn(
                 f"No updater follows the delayed network(s) {forgotten} of "
@@ -377,11 +313,12 @@ class UpdaterSequence(TargetNetUpdater):
         return f"{type(self).__name__}(\n{lines})"
 
 
-def _delayed_networks(loss_module: LossModule, networks: tuple[str, ...]) -> tuple[str, ...]:
+def _delayed_networks(loss_module: LossModule, networks: tuple[str, ...] = ()) -> tuple[str, ...]:
     """Checks the names against the delayed networks of the loss; all of them if none is named."""
     loss = type(loss_module).__name__
-    known = list(loss_module._has_update_associated)
-    delayed = [name for name in known if f"target_{name}_params" in loss_module._modules]
+    known = list(networks_with_updater(loss_module))
+    children = dict(loss_module.named_children())
+    delayed = [name for name in known if f"target_{name}_params" in children]
     if not networks and not delayed:
         raise ValueError(f"{loss} has no delayed networks. {_how_to_delay(loss_module)}")
     for name in networks:
@@ -397,23 +334,22 @@ def _delayed_networks(loss_module: LossModule, networks: tuple[str, ...]) -> tup
     return networks or tuple(delayed)
 
 
-def _how_to_delay(loss_module: LossModule, network: str | None = None) -> str:
+def _how_to_delay(loss_module: LossModule, network: str = "") -> str:
     """Names the ``delay_*`` flag of a network where it has one, else the flags that there are."""
-    flags = [
-        name
+    parameters = {
+        name: None  # in their order
         for base in type(loss_module).__mro__
         for name in inspect.signature(base.__init__).parameters
-        if name.startswith("delay_")
-    ]
-    if network is not None:
-        flag = f"delay_{network.removesuffix('_network')}"
-        flags = [flag] if flag in flags else flags
+    }
+    own = f"delay_{network.removesuffix('_network')}"
+    flags = [own] if own in parameters else [n for n in parameters if n.startswith("delay_")]
     if not flags:
         return "This loss has no delay_* flag."
-    return "Build the loss with " + " or ".join(f"{f}=True" for f in dict.fromkeys(flags)) + "."
+    return "Build the loss with " + " or ".join(f"{flag}=True" for flag in flags) + "."
 
 
-def _check_composable(updaters: tuple[TargetNetUpdater, ...]) -> None:
+def _owners(updaters: tuple[TargetNetUpdater, ...]) -> dict[str, TargetNetUpdater]:
+    """The updater of each network; refuses what is no sequence."""
     if not updaters:
         raise ValueError("UpdaterSequence needs at least one updater.")
     owners: dict[str, TargetNetUpdater] = {}
@@ -427,10 +363,13 @@ def _check_composable(updaters: tuple[TargetNetUpdater, ...]) -> None:
                 "The updaters of an UpdaterSequence must belong to one loss: build a sequence for "
                 "each loss."
             )
-        for target in updater._target_names:
-            if target in owners:
+        # TorchRL's own updaters follow every delayed network.
+        ours = isinstance(updater, (_NetworkUpdater, UpdaterSequence))
+        for name in updater.networks if ours else _delayed_networks(updater.loss_module):
+            if name in owners:
                 raise ValueError(
-                    f"{target} has two updaters, {type(owners[target]).__name__} and "
+                    f"target_{name}_params has two updaters, {type(owners[name]).__name__} and "
                     f"{type(updater).__name__}: name each network in one of them only."
                 )
-            owners[target] = updater
+            owners[name] = updater
+    return owners

@@ -212,7 +212,7 @@ def make_updater(config: DictConfig, loss_module: LossModule) -> TargetNetUpdate
         delayed.remove("actor_network")
         interval = config.loss.reference_interval
         updaters.append(PeriodicCopy(loss_module, "actor_network", interval=interval))
-    return UpdaterSequence(PolyakAverage(loss_module, *delayed, tau=config.polyak), *updaters)
+    return UpdaterSequence(PolyakAverage(loss_module, *delayed, weight=config.polyak), *updaters)
 
 
 def make_optimizer(learning_rates: DictConfig, loss_module: LossModule) -> torch.optim.Optimizer:

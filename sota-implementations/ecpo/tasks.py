@@ -106,7 +106,6 @@ def make_algorithmic(config: DictConfig) -> Task:
         num_observations=env.task.base + 1,
         nvec=action_spec.nvec[0, 0].tolist(),
         hidden_size=config.env.hidden_size,
-        head=config.env.head,
         distinct_histories=config.env.distinct_histories,
     )
     other = AlgorithmicEnv(config.env.name, num_groups=EVALUATION_EPISODES, curriculum=None)

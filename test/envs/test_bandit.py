@@ -77,10 +77,10 @@ def test_expected_reward_is_what_samples_tend_to():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"num_actions": 0}, "num_actions must be at least 1, got 0"),
-        ({"num_features": -1}, "num_features must be at least 1, got -1"),
-        ({"group_size": 0}, "group_size must be at least 1, got 0"),
-        ({"num_groups": 0}, "num_groups must be at least 1, got 0"),
+        ({"num_actions": 0}, "num_actions must be an integer of at least 1, got 0"),
+        ({"num_features": -1}, "num_features must be an integer of at least 1, got -1"),
+        ({"group_size": 0}, "group_size must be an integer of at least 1, got 0"),
+        ({"num_groups": 0}, "num_groups must be an integer of at least 1, got 0"),
     ],
 )
 def test_bad_sizes_are_refused(options, message):

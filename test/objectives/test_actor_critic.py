@@ -402,7 +402,7 @@ def test_a_live_q_is_what_the_target_sees(case):
     batch = _batch(case)
     expected = call(loss, batch)
     assert not torch.allclose(call(copied, batch)["loss_qvalue"], expected["loss_qvalue"])
-    PolyakAverage(copied, tau=1.0).step()
+    PolyakAverage(copied, weight=1.0).step()
     assert_close(call(copied, batch), expected)
 
 
@@ -426,7 +426,8 @@ def test_updaters(case, value):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         updater = UpdaterSequence(
-            PeriodicCopy(loss, "actor_network", interval=2), PolyakAverage(loss, critic, tau=0.25)
+            PeriodicCopy(loss, "actor_network", interval=2),
+            PolyakAverage(loss, critic, weight=0.25),
         )
         call(loss, _batch(case))
     become(loss, new)

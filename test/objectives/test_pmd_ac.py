@@ -102,7 +102,7 @@ def test_trains_as_sac_does(dtype):
     """Ten steps of Adam with target networks: the same parameters at the end."""
     networks = make_networks(dtype=dtype)
     ours, theirs = both(networks)
-    updaters = PolyakAverage(ours, tau=0.1), SoftUpdate(theirs, tau=0.1)
+    updaters = PolyakAverage(ours, weight=0.1), SoftUpdate(theirs, tau=0.1)
     optimizers = [torch.optim.Adam(loss.parameters(), 1e-2) for loss in (ours, theirs)]
     for step in range(10):
         batch = make_batch(dtype=dtype, seed=step)

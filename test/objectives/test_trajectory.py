@@ -324,7 +324,7 @@ def test_actor_that_rewrites_its_input(case):
         (lambda loss: SoftUpdate(loss, tau=0.25), 0.25),
         (lambda loss: HardUpdate(loss, value_network_update_interval=0), 1.0),
         (lambda loss: PeriodicCopy(loss, "actor_network", interval=1), 1.0),
-        (lambda loss: PolyakAverage(loss, "actor_network", tau=0.25), 0.25),
+        (lambda loss: PolyakAverage(loss, "actor_network", weight=0.25), 0.25),
     ],
     ids=["SoftUpdate", "HardUpdate", "PeriodicCopy", "PolyakAverage"],
 )

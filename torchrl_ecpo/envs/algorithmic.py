@@ -6,7 +6,6 @@ flattened, `n` of them selected, `L` = 32 columns of input, `R` rows of input, `
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -17,6 +16,7 @@ from torch import Tensor, nn
 from torchrl.data import Categorical, Composite, MultiCategorical, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_ecpo.checks import check_count
 from torchrl_ecpo.envs._groups import GroupIdAllocator
 
 __all__ = ["TASKS", "AlgorithmicEnv", "AlgorithmicTask"]
@@ -103,14 +103,6 @@ TASKS: dict[str, AlgorithmicTask] = {
 }
 
 
-def _task_name(task: str) -> str:
-    """The key in `TASKS`, also from gym's names (`"DuplicatedInput"`, `"DuplicatedInput-v0"`)."""
-    name = re.sub(r"(?<!^)(?=[A-Z])", "_", task.removesuffix("-v0")).lower()
-    if name not in TASKS:
-        raise ValueError(f"Unknown task {task!r}: expected one of {', '.join(TASKS)}.")
-    return name
-
-
 def _indices(mask: Tensor) -> Tensor:
     """Where a mask is set, `[n]`, counted over all its dimensions."""
     return mask.reshape(-1).nonzero().squeeze(-1)
@@ -170,16 +162,6 @@ class _Curriculum(nn.Module):
         levels[units] = (levels[units] + promoted).clamp(max=_TOP_LEVEL)
 
 
-@dataclass
-class _Draw:
-    """Random material of `n` instances: characters `[n, L, R]`, the others `[n]`."""
-
-    characters: Tensor
-    extra_length: Tensor
-    level: Tensor
-    group: Tensor
-
-
 class _InstanceQueue(nn.Module):
     """For each row, the instances that not all of its copies have taken yet.
 
@@ -221,8 +203,12 @@ class _InstanceQueue(nn.Module):
         """Forget what is pending: the copies of a row go on together with a new instance."""
         self.taken.copy_(self.drawn.unsqueeze(-1).expand_as(self.taken))
 
-    def take(self, rows: Tensor, level: Tensor) -> _Draw:
-        """The next instance of each of the copies `rows` `[n]`, drawn at `level` `[N]` if new."""
+    def take(self, rows: Tensor, level: Tensor) -> list[Tensor]:
+        """The next instance of each of the copies `rows` `[n]`, drawn at `level` `[N]` if new.
+
+        Returns:
+            Characters `[n, L, R]`, extra length, level and group `[n]`.
+        """
         group_size = self.taken.shape[1]
         taken, row = self.taken.view(-1), rows // group_size
         turn = taken[rows]
@@ -231,7 +217,7 @@ class _InstanceQueue(nn.Module):
         self._draw(_indices(missing), level.view_as(self.taken)[:, 0])
         taken[rows] = turn + 1
         slot = turn % self.level.shape[1]
-        return _Draw(*(getattr(self, name)[row, slot] for name in self._RINGS))
+        return [getattr(self, name)[row, slot] for name in self._RINGS]
 
     def _draw(self, row: Tensor, level: Tensor) -> None:
         count, task = row.numel(), self.task
@@ -284,10 +270,10 @@ class AlgorithmicEnv(EnvBase):
     """The algorithmic tasks of gym 0.19: read a tape with a moving head, write the right answer.
 
     Batched on tensors: `batch_size` is `[num_groups, group_size]`, and the `group_size` copies of
-    a row play the same problem instance, which is what the trajectory-group losses need. The rules
-    are gym's: a right character is worth 1, a wrong one -0.5 and the end; the episode also ends
-    with the last character of the target. The step that exceeds the time limit is the last, worth
-    -1 instead of what it earned; it counts as `terminated` (`truncated` is never set).
+    a row play the same problem instance, as the trajectory-group losses need it. A right character
+    is worth 1, a wrong one -0.5 and the end; the episode also ends with the last character of the
+    target. The step that exceeds the time limit is the last, worth -1 instead of what it earned; it
+    counts as `terminated` (`truncated` is never set).
 
     The action is int64 `[..., 3]`: move (left, right and, if the input has several rows, up,
     down), write (0 or 1), character. Besides `done`, `terminated`, `truncated` and, after a step,
@@ -310,35 +296,30 @@ class AlgorithmicEnv(EnvBase):
     **Given instances.** `reset(instance=...)` plays what it is given: int64 `[*batch, L]`, or
     `[*batch, L, rows]` if the input has several rows, L at most 32, the characters first and then
     -1 as padding. Identical instances in a row get one `group`. They count for the curriculum like
-    drawn ones, at the present level, and leave the row's sequence of drawn instances alone. An
-    entry `"instance"` of the tensordict that `reset` gets does the same, also through a
-    `SerialEnv`, but not through a `TransformedEnv`, whose `reset` drops it.
+    drawn ones, at the present level, and leave the row's sequence of drawn instances alone.
 
     **Curriculum.** `min_length` goes up by one, to 30 at most, after `last` successes in a row
-    (see `TASKS`). A success is, in effect, a perfect episode. Episodes are counted when they are
-    followed by a reset.
+    (see `TASKS`). A success is, in effect, a perfect episode, counted when a reset follows.
 
     - `"group"`: a level for each row. An instance counts once, by its first copy: counting every
       copy would promote too early, as the copies of an easy instance succeed together.
     - `"batch"`: one level for all rows. Each instance counts once, in order of reset, then of row,
-      with at most one promotion a reset. `last` is not scaled by the number of rows: the level
-      goes up after as many instances as in gym, hence in fewer resets.
-    - `"gym"`: a level for each copy, by gym's rule to the letter, in which interrupted episodes
-      count, and also an empty one: gym's constructor starts an episode that the first reset counts
-      as played with return 0 (a success by its rule if the target has one character). The copies
-      of a row share the random draw, so that those at one level play the identical instance;
-      `group` tells the levels apart.
+      with at most one promotion a reset.
+    - `"gym"`: a level for each copy, by gym's rule to the letter. Interrupted episodes count. So
+      does the episode that gym's constructor starts, with return 0. The copies of a row share the
+      random draw; those at one level play the identical instance, and `group` tells the levels
+      apart.
     - `None`: `min_length` stays.
 
-    `"group"` and `"batch"` have no empty episode, which is an artefact of gym's constructor. Nor
-    do they count interrupted episodes, or instances drawn before the latest promotion.
+    `"group"` and `"batch"` count no interrupted episodes, nor instances drawn before the latest
+    promotion.
 
     `state_dict` holds all that is needed to go on identically: tapes and heads, pending instances,
     `curriculum.levels`, `curriculum.streaks` (successes in a row) and the random generator's
     state. Only the group ids of instances drawn later differ.
 
     Args:
-        task: a key of `TASKS`, or gym's name.
+        task: a key of `TASKS`.
 
     Keyword Args:
         num_groups: rows of the batch. Default: 1.
@@ -396,8 +377,9 @@ class AlgorithmicEnv(EnvBase):
         device: torch.device | str | int | None = None,
     ) -> None:
         """Make the environment; the class describes the arguments."""
-        self.task_name = _task_name(task)
-        self.task = TASKS[self.task_name]
+        if task not in TASKS:
+            raise ValueError(f"Unknown task {task!r}: expected one of {', '.join(TASKS)}.")
+        self.task_name, self.task = task, TASKS[task]
         self._check_arguments(num_groups, group_size, min_length, curriculum)
         batch_size = (num_groups, group_size)
         super().__init__(batch_size=batch_size, device=device)
@@ -415,9 +397,8 @@ class AlgorithmicEnv(EnvBase):
     def _check_arguments(
         self, num_groups: int, group_size: int, min_length: int | None, curriculum: str | None
     ) -> None:
-        for name, value in (("num_groups", num_groups), ("group_size", group_size)):
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}.")
+        check_count("num_groups", num_groups)
+        check_count("group_size", group_size)
         lowest = self.task.duplication
         if min_length is not None and not lowest <= min_length <= _TOP_LEVEL:
             raise ValueError(
@@ -487,12 +468,6 @@ class AlgorithmicEnv(EnvBase):
         }.items():
             self.register_buffer(name, value, persistent=False)
 
-    @property
-    def read_head(self) -> Tensor:
-        """Position of the read head, 0 at the start, `[G, K]`, or (column, row), `[G, K, 2]`."""
-        head = self._cursor[:, :2].view(*self.batch_size, 2) - 1
-        return head if self.task.rows > 1 else head[..., 0]
-
     def _set_seed(self, seed: int | None) -> None:
         self._queue.clear()
         if seed is None:
@@ -507,10 +482,7 @@ class AlgorithmicEnv(EnvBase):
         instance: Tensor | None = None,
         **kwargs: object,
     ) -> TensorDictBase:
-        selected = None
-        if tensordict is not None:
-            selected = tensordict.get("_reset", None)
-            instance = tensordict.get("instance", None) if instance is None else instance
+        selected = None if tensordict is None else tensordict.get("_reset", None)
         rows = self._every_row if selected is None else _indices(selected)
         given = None if instance is None else self._check_instance(instance, rows)
         shortfall = self._return[rows] - self._bound[rows, 0]
@@ -529,14 +501,13 @@ class AlgorithmicEnv(EnvBase):
     def _start(self, rows: Tensor) -> None:
         """Start the next drawn instance of the copies `rows` `[n]`."""
         levels = self.curriculum.current()
-        draw = self._queue.take(rows, levels)
-        level, group = draw.level, draw.group
+        characters, extra_length, level, group = self._queue.take(rows, levels)
         if self.curriculum.kind == "gym":
             level = levels[rows]
             group = group + level
-        length = level + draw.extra_length
+        length = level + extra_length
         length = length - length % self.task.duplication
-        self._play(rows, draw.characters, length, level, group)
+        self._play(rows, characters, length, level, group)
 
     def _play(
         self, rows: Tensor, characters: Tensor, length: Tensor, level: Tensor, group: Tensor
@@ -580,24 +551,19 @@ class AlgorithmicEnv(EnvBase):
             (0, 0, 0, _MAX_LENGTH - columns),
             value=_PADDING,
         )
-        strange = (characters < _PADDING) | (characters >= base)
-        if strange.any():
+        length = (characters[..., 0] != _PADDING).sum(1)
+        inside = torch.arange(_MAX_LENGTH, device=instance.device) < length.unsqueeze(-1)
+        is_character = (characters >= 0) & (characters < base)
+        right = torch.where(inside.unsqueeze(-1), is_character, characters == _PADDING).all(-1)
+        if self.task.duplication == 2:
+            right[:, ::2] &= characters[:, ::2, 0] == characters[:, 1::2, 0]
+        right = right.all(-1) & (length > 0)
+        if not right.all():
             raise ValueError(
-                f"'instance' of {self.task_name} must hold characters in 0..{base - 1}, and "
-                f"{_PADDING} as padding, got {characters[strange][0].item()}."
+                f"'instance' of {self.task_name} must hold characters in 0..{base - 1}, at least "
+                f"one, then {_PADDING} as padding, in all rows of the input alike (each character "
+                f"twice for duplicated_input), got {characters[~right][0].squeeze(-1).tolist()}."
             )
-        inside = characters != _PADDING
-        length = inside[..., 0].sum(1)
-        if (length == 0).any():
-            raise ValueError("'instance' must hold at least one character in each episode.")
-        column = torch.arange(_MAX_LENGTH, device=instance.device)
-        if (inside != (column < length.unsqueeze(-1)).unsqueeze(-1)).any():
-            raise ValueError(
-                f"'instance' must be padded ({_PADDING}) after its last column only, and in all "
-                "rows of the input alike."
-            )
-        if self.task.duplication == 2 and (characters[:, ::2] != characters[:, 1::2]).any():
-            raise ValueError(f"'instance' of {self.task_name} must hold each character twice.")
         return characters, length
 
     def _groups_of(self, instances: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from torch import Tensor
 from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_ecpo.checks import check_count
 from torchrl_ecpo.envs._groups import GroupIdAllocator
 
 __all__ = ["BanditEnv"]
@@ -29,7 +30,7 @@ class BanditEnv(EnvBase):
         num_features: length of the feature vectors; defaults to 20, the paper's.
         exponent: of s_i; defaults to 8, the paper's.
         instance_seed: draws rewards and features; the same number gives the same bandit on every
-            device. Independent of ``set_seed``, for an episode has no randomness.
+            device. ``set_seed`` has no effect: an episode is not random.
         num_groups: rows of the batch.
         group_size: K, actions drawn from the policy for each group.
         device: where the bandit lives.
@@ -61,15 +62,10 @@ class BanditEnv(EnvBase):
         group_size: int = 100,
         device: torch.device | str | None = None,
     ) -> None:
-        sizes = {
-            "num_actions": num_actions,
-            "num_features": num_features,
-            "num_groups": num_groups,
-            "group_size": group_size,
-        }
-        for name, size in sizes.items():
-            if size < 1:
-                raise ValueError(f"{name} must be at least 1, got {size}.")
+        check_count("num_actions", num_actions)
+        check_count("num_features", num_features)
+        check_count("num_groups", num_groups)
+        check_count("group_size", group_size)
         super().__init__(batch_size=torch.Size([num_groups, group_size]), device=device)
         generator = torch.Generator().manual_seed(instance_seed)
         rewards = torch.rand(num_actions, generator=generator).pow(exponent)
@@ -129,4 +125,4 @@ class BanditEnv(EnvBase):
         )
 
     def _set_seed(self, seed: int | None) -> None:
-        """Nothing to seed: the instance has a seed of its own, and an episode no randomness."""
+        """Nothing to seed: `instance_seed` draws the rewards, and an episode is not random."""

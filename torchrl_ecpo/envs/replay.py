@@ -16,11 +16,11 @@ __all__ = ["EpisodeReplay"]
 class EpisodeReplay(Transform):
     """Makes the state of a gymnasium or dm_control task part of the environment's state dict.
 
-    A simulator's state is spread over arrays, counters of wrappers and attributes of a task, and
-    each has others. What every task here can do is to play an episode again: the state dict holds
-    the random generator's state before the last reset and the actions since; loading it resets and
-    repeats them. That costs as much as the steps themselves, and is exact, as the rules of these
-    tasks are deterministic but for that generator.
+    A simulator's state is spread over arrays, counters of wrappers and attributes of a task, which
+    differ from one to the next. Every task can play an episode again: the state dict holds the
+    random generator's state before the last reset and the actions since; loading it resets and
+    repeats them. That costs as much as the steps themselves. It is exact, because that generator is
+    all that is random in these tasks.
 
     Only the simulator is put where it was: what an episode has summed or counted so far travels in
     the tensordict that the caller holds.
@@ -60,7 +60,7 @@ class EpisodeReplay(Transform):
         is_begun = self._start is not None
         return {
             "is_begun": is_begun,
-            "start": self._start if is_begun else self._random_state(),
+            "start": self._start or self._random_state(),
             "actions": list(self._actions),
         }
 
@@ -91,10 +91,6 @@ class EpisodeReplay(Transform):
 
     def _generator(self) -> Any:
         container: Any = self.container
+        # TorchRL hands on what it does not know to gymnasium's or dm_control's environment.
         env = container.base_env
-        if isinstance(env, GymWrapper):
-            return env._env.unwrapped.np_random
-        native = env._env
-        while not hasattr(native, "task"):  # rendering wraps dm_control's environment
-            native = native._env
-        return native.task.random
+        return env.np_random if isinstance(env, GymWrapper) else env.task.random

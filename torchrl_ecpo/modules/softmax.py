@@ -82,10 +82,7 @@ class SharedCategorical(Distribution):
         """The most probable action, ``[...]``."""
         return self.row.probs.argmax(-1).expand(self.batch_shape)
 
-    @property
-    def deterministic_sample(self) -> Tensor:
-        """The mode, where TorchRL asks for a deterministic action."""
-        return self.mode
+    deterministic_sample = mode  # which `ExplorationType.DETERMINISTIC` asks for
 
 
 def make_softmax_policy(features: Tensor) -> ProbabilisticTensorDictSequential:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -19,37 +19,34 @@ from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
 
 __all__ = ["TupleCategorical", "make_tuple_policy"]
 
-Head = Literal["masked", "unmasked", "joint"]
+
+def _num_logits(nvec: Sequence[int]) -> int:
+    if len(nvec) != 3 or nvec[1] != 2 or min(nvec) < 1:
+        raise ValueError(
+            "nvec: expected (moves, 2, characters), the sizes of move, write flag and "
+            f"character, got {tuple(nvec)}."
+        )
+    return sum(nvec)
 
 
 class TupleCategorical(Distribution):
     """Distribution of the action tuple (move, write, character).
 
-    Three heads. With the first and the last the character is 0 where nothing is written (write =
-    0), and has no log-probability there.
-
-    - `"masked"`: log p(move) + log p(write) + [write = 1] log p(character). The environment ignores
-      the character where nothing is written; without the mask an entropy term would reward its
-      noise.
-    - `"unmasked"`: three independent factors.
-    - `"joint"`: one softmax over move and (nothing, or a character to write), so over
-      `nvec[0] * (1 + nvec[2])` classes, in that order; it can express any distribution of what the
-      environment tells apart.
+    log p(move) + log p(write) + [write = 1] log p(character): the character is 0 where nothing is
+    written (write = 0), and has no log-probability there. The environment ignores it there, and an
+    entropy term would reward its noise.
 
     `B` is any batch shape. Logits of any finite size give finite entropies and no NaN.
 
     Args:
-        logits: `[*B, L]`, unnormalised; L = sum(nvec), or nvec[0] * (1 + nvec[2]) for the joint
-            head.
+        logits: `[*B, L]`, unnormalised; L = sum(nvec).
         nvec: the number of moves, of write flags (2) and of characters.
-        head: see above. Default `"masked"`: without the mask our runs on Reverse and
-            ReversedAddition failed.
         validate_args: whether NaN logits and actions out of range are refused. Default True; False
             saves the checks, and on a GPU their synchronisation.
 
     Raises:
-        ValueError: if the head is unknown, nvec is not of the form (moves, 2, characters), L is
-            another size, or a logit is NaN.
+        ValueError: if nvec is not of the form (moves, 2, characters), L is another size, or a logit
+            is NaN.
 
     Examples:
         >>> import torch
@@ -62,60 +59,22 @@ class TupleCategorical(Distribution):
         0.25
     """
 
-    has_rsample = False
+    arg_constraints: dict = {"logits": constraints.real_vector}  # noqa: RUF012 - as torch has it
+    support: constraints.Constraint = constraints.independent(constraints.nonnegative_integer, 1)
 
-    def __init__(
-        self,
-        logits: Tensor,
-        nvec: Sequence[int],
-        head: Head = "masked",
-        validate_args: bool = True,
-    ) -> None:
-        size = self.num_logits(nvec, head)
+    def __init__(self, logits: Tensor, nvec: Sequence[int], validate_args: bool = True) -> None:
+        size = _num_logits(nvec)
         if logits.shape[-1:] != (size,):
             raise ValueError(
-                f"logits: expected a last dimension of {size} for head={head!r} and "
-                f"nvec={tuple(nvec)}, got shape {tuple(logits.shape)}."
+                f"logits: expected a last dimension of {size} for nvec={tuple(nvec)}, got shape "
+                f"{tuple(logits.shape)}."
             )
         if validate_args and logits.isnan().any():
             raise ValueError("logits: expected numbers, got NaN; the network's weights may be NaN.")
-        self.nvec, self.head, self.logits = tuple(nvec), head, logits
+        self.nvec, self.logits = tuple(nvec), logits
         # The base class would check the same constraint, at several times the cost.
         super().__init__(logits.shape[:-1], torch.Size([3]), validate_args=False)
         self._validate_args = validate_args
-
-    @staticmethod
-    def num_logits(nvec: Sequence[int], head: Head = "masked") -> int:
-        """The number of logits that a head needs.
-
-        Args:
-            nvec: the number of moves, of write flags (2) and of characters.
-            head: one of "masked", "unmasked" and "joint".
-
-        Returns:
-            The size of the last dimension of `logits`.
-
-        Raises:
-            ValueError: if the head is unknown or nvec is not of the form (moves, 2, characters).
-        """
-        if head not in ("masked", "unmasked", "joint"):
-            raise ValueError(f"head: expected 'masked', 'unmasked' or 'joint', got {head!r}.")
-        if len(nvec) != 3 or nvec[1] != 2 or min(nvec) < 1:
-            raise ValueError(
-                "nvec: expected (moves, 2, characters), the sizes of move, write flag and "
-                f"character, got {tuple(nvec)}."
-            )
-        return nvec[0] * (1 + nvec[2]) if head == "joint" else sum(nvec)
-
-    @property
-    def arg_constraints(self) -> dict[str, constraints.Constraint]:
-        """Logits without NaN."""
-        return {"logits": constraints.real_vector}
-
-    @property
-    def support(self) -> constraints.Constraint:
-        """Tuples of integers of at least 0; their upper bounds are nvec."""
-        return constraints.independent(constraints.nonnegative_integer, 1)
 
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
         """Draw actions by the Gumbel-max trick, in one pass over the logits.
@@ -142,7 +101,9 @@ class TupleCategorical(Distribution):
             int64 `[*sample_shape, *B, 3]`.
         """
         gumbel = uniform.log_().neg_().log_()  # its negative
-        return self._decode(self._factors(self.logits.detach() - gumbel).argmax(-1))
+        choice = self._factors(self.logits.detach() - gumbel).argmax(-1)
+        choice[..., 2].mul_(choice[..., 1])
+        return choice
 
     def sample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
         """Draw actions and give their log-probabilities; there is no need to check their range.
@@ -158,24 +119,20 @@ class TupleCategorical(Distribution):
 
     @property
     def mode(self) -> Tensor:
-        """The most probable action, int64 `[*B, 3]`; exact for each head."""
+        """The most probable action, int64 `[*B, 3]`."""
         choice = self._log_probs.argmax(-1)
-        if self.head == "masked":
-            _, write, character = self._log_probs.unbind(-2)
-            choice[..., 1] = write[..., 1] + character.amax(-1) > write[..., 0]
-        return self._decode(choice)
+        _, write, character = self._log_probs.unbind(-2)
+        choice[..., 1] = write[..., 1] + character.amax(-1) > write[..., 0]
+        choice[..., 2].mul_(choice[..., 1])
+        return choice
 
-    @property
-    def deterministic_sample(self) -> Tensor:
-        """The most probable action, which `ExplorationType.DETERMINISTIC` asks for."""
-        return self.mode
+    deterministic_sample = mode  # which `ExplorationType.DETERMINISTIC` asks for
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-probability of actions.
 
         Args:
-            value: int64 `[..., 3]`, broadcast against the batch shape. Where nothing is written
-                the character is read only by the unmasked head.
+            value: int64 `[..., 3]`, broadcast against the batch shape.
 
         Returns:
             `[...]`.
@@ -189,25 +146,22 @@ class TupleCategorical(Distribution):
 
     def _score(self, value: Tensor) -> Tensor:
         """Log-probability of actions within range."""
-        index, log_probs = self._encode(value), self._log_probs
+        index, log_probs = value, self._log_probs
         if index.shape[:-1] != self.batch_shape:
             shape = torch.broadcast_shapes(index.shape[:-1], self.batch_shape)
             log_probs = log_probs.expand(*shape, *log_probs.shape[-2:])
             index = index.expand(*shape, -1)
-        log_probs = log_probs.gather(-1, index.unsqueeze(-1)).squeeze(-1)
-        return self._sum(log_probs, value[..., 1] == 1)
+        move, write, character = log_probs.gather(-1, index.unsqueeze(-1)).squeeze(-1).unbind(-1)
+        return move + write + torch.where(value[..., 1] == 1, character, 0)
 
     def entropy(self) -> Tensor:
         """Exact entropy of the tuple, in nats, `[*B]`."""
-        entropies = -(self._log_probs.exp() * self._log_probs).sum(-1)
-        if self.head != "masked":
-            return entropies.sum(-1)
-        move, write, character = entropies.unbind(-1)
+        move, write, character = (-(self._log_probs.exp() * self._log_probs).sum(-1)).unbind(-1)
         return move + write + character * self._log_probs[..., 1, 1].exp()
 
     @lazy_property
     def _log_probs(self) -> Tensor:
-        """Normalised log-probabilities of each factor, `[*B, F, n]`."""
+        """Normalised log-probabilities of each factor, `[*B, 3, n]`."""
         # The floor keeps 0 * log 0 at 0, for the padding and where a difference of logits
         # overflows.
         floor = torch.finfo(self.logits.dtype).min
@@ -216,9 +170,7 @@ class TupleCategorical(Distribution):
         return (factors - factors.logsumexp(-1, keepdim=True)).clamp(min=floor)
 
     def _factors(self, values: Tensor) -> Tensor:
-        """Values of each logit `[..., L]`, by factor, padded with -inf: `[..., F, n]`."""
-        if self.head == "joint":
-            return values.unsqueeze(-2)
+        """Values of each logit `[..., L]`, by factor, padded with -inf: `[..., 3, n]`."""
         width = max(self.nvec)
         if min(self.nvec) < width:
             parts = values.split(self.nvec, -1)
@@ -226,30 +178,6 @@ class TupleCategorical(Distribution):
                 [F.pad(part, (0, width - part.shape[-1]), value=-torch.inf) for part in parts], -1
             )
         return values.unflatten(-1, (3, width))
-
-    def _sum(self, log_probs: Tensor, writes: Tensor) -> Tensor:
-        """The tuple's log-probability from its factors' `[..., F]`."""
-        if self.head != "masked":
-            return log_probs.sum(-1)
-        move, write, character = log_probs.unbind(-1)
-        return move + write + torch.where(writes, character, 0)
-
-    def _decode(self, choice: Tensor) -> Tensor:
-        """The action `[..., 3]` that has the class `choice` `[..., F]` of each factor."""
-        if self.head == "joint":
-            written = choice.squeeze(-1) % (1 + self.nvec[2])
-            move = choice.squeeze(-1) // (1 + self.nvec[2])
-            return torch.stack([move, (written > 0).long(), (written - 1).clamp(min=0)], -1)
-        if self.head == "masked":
-            choice[..., 2].mul_(choice[..., 1])
-        return choice
-
-    def _encode(self, action: Tensor) -> Tensor:
-        """The class of each factor, `[..., F]`, that an action `[..., 3]` has."""
-        if self.head != "joint":
-            return action
-        move, write, character = action.unbind(-1)
-        return (move * (1 + self.nvec[2]) + write * (1 + character)).unsqueeze(-1)
 
     def _check_range(self, action: Tensor) -> None:
         if action.shape[-1:] != (3,):
@@ -270,7 +198,6 @@ def make_tuple_policy(
     nvec: Sequence[int],
     *,
     hidden_size: int = 128,
-    head: Head = "masked",
     distinct_histories: bool = True,
     store_states: bool = False,
     device: torch.device | str | None = None,
@@ -288,7 +215,6 @@ def make_tuple_policy(
         num_observations: the number of observations, the blank included.
         nvec: the number of moves, of write flags (2) and of characters.
         hidden_size: of the LSTM. Default 128 (the UREX paper's).
-        head: "masked", "unmasked" or "joint": see :class:`TupleCategorical`.
         distinct_histories: whether rows with equal histories are computed once
             (:class:`DistinctHistoryLSTM`), or each row by :class:`torchrl.modules.LSTMModule`. The
             numbers and the order of the parameters are the same.
@@ -302,7 +228,7 @@ def make_tuple_policy(
         `TrajectoryGroupCollector` does without either.
 
     Raises:
-        ValueError: if `head` or `nvec` are not as above.
+        ValueError: if `nvec` is not of the form (moves, 2, characters).
 
     Examples:
         >>> import torch
@@ -323,12 +249,11 @@ def make_tuple_policy(
         ...     actor.get_dist(data).entropy().shape
         torch.Size([4, 10])
     """
-    num_logits = TupleCategorical.num_logits(nvec, head)
     num_classes = [num_observations, *(n + 1 for n in nvec)]
     inputs: list[NestedKey] = ["observation", "previous_action"]
     factory: dict[str, Any] = {"device": device, "dtype": dtype}
     core: Any
-    readout = nn.Linear(hidden_size, num_logits, **factory)
+    readout = nn.Linear(hidden_size, _num_logits(nvec), **factory)
     if distinct_histories:
         core = DistinctHistoryLSTM(
             num_classes,
@@ -351,7 +276,7 @@ def make_tuple_policy(
         core,
         in_keys=["logits"],
         distribution_class=TupleCategorical,
-        distribution_kwargs={"nvec": tuple(nvec), "head": head},
+        distribution_kwargs={"nvec": tuple(nvec)},
         default_interaction_type=ExplorationType.RANDOM,
         return_log_prob=True,
         log_prob_key="action_log_prob",
@@ -364,13 +289,18 @@ class _TupleActor(ProbabilisticActor):
     That way costs as much as the LSTM over a few distinct histories.
     """
 
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.all_out_keys = list(self.out_keys)
+
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """Write what the core writes, action and log-probability; see the base class."""
         modules: Any = self.module
         core, head = modules
         kind = exploration_type() or head.default_interaction_type
         usual = len(args) == 1 and isinstance(args[0], TensorDictBase) and not kwargs
-        if not usual or kind is not ExplorationType.RANDOM or self._select_before_return:
+        selected = self.out_keys != self.all_out_keys
+        if not usual or kind is not ExplorationType.RANDOM or selected:
             return super().forward(*args, **kwargs)
         tensordict = core(args[0])
         distribution = TupleCategorical(tensordict.get("logits"), **head.distribution_kwargs)
