@@ -177,6 +177,19 @@ def test_a_curve_of_one_point_is_seen():
     assert [line.get_marker() for line in panel.lines] == ["o", "None"]
 
 
+def test_the_band_of_a_curve_is_the_standard_error_over_runs():
+    panel, steps = Figure().subplots(), np.array([10.0, 20.0, 30.0])
+    # Deviations of -2, 0 and 2 have a sample variance of 8 / 2, and the mean of three a third of it.
+    curves = {"three": (steps, np.array([[2.0, 1.0, 7.0], [4.0, 1.0, 5.0], [6.0, 1.0, 3.0]]))}
+    _draw_curves(panel, curves, {"three": "k"}, {"three": "three"})
+    (band,) = panel.collections
+    corners = band.get_paths()[0].vertices
+    edges = [{y for x, y in corners if x == step} for step in steps]
+    error = (4 / 3) ** 0.5
+    assert [min(edge) for edge in edges] == pytest.approx([4 - error, 1, 5 - error])
+    assert [max(edge) for edge in edges] == pytest.approx([4 + error, 1, 5 + error])
+
+
 def test_methods_are_told_apart_by_what_is_null_too(runs):
     for name, target in (("fixed", None), ("learned", 0.1)):
         loss = {"name": "ecac", "target_kl": target}
