@@ -179,7 +179,7 @@ def test_a_curve_of_one_point_is_seen():
 
 def test_the_band_of_a_curve_is_the_standard_error_over_runs():
     panel, steps = Figure().subplots(), np.array([10.0, 20.0, 30.0])
-    # Deviations of -2, 0 and 2 have a sample variance of 8 / 2, and the mean of three a third of it.
+    # -2, 0 and 2 around the mean: a sample variance of 8 / 2, a third of it for the mean of three.
     curves = {"three": (steps, np.array([[2.0, 1.0, 7.0], [4.0, 1.0, 5.0], [6.0, 1.0, 3.0]]))}
     _draw_curves(panel, curves, {"three": "k"}, {"three": "three"})
     (band,) = panel.collections

@@ -135,6 +135,12 @@ def align(curves: Sequence[np.ndarray]) -> Curve | None:
     return steps, np.stack(values)
 
 
+def read_cells(manifest: Manifest, study: Study, results: Path = RESULTS) -> list[CellResult]:
+    """What was collected of a study in a folder of results."""
+    collected = Results.read(results / "study" / study.name)
+    return [read_cell(cell, collected) for cell in manifest.cells(study)]
+
+
 def read_cell(cell: Cell, results: Results) -> CellResult:
     """The results of a cell; a run with other options than the cell's now is none of it."""
     options, complete, unfinished = " ".join(cell.options), {}, 0
@@ -451,8 +457,7 @@ def write_report(manifest: Manifest, results: Path, docs: Path) -> Path:
     """
     sections, waiting = [], []
     for study in manifest.studies.values():
-        collected = Results.read(results / "study" / study.name)
-        cells = [read_cell(cell, collected) for cell in manifest.cells(study)]
+        cells = read_cells(manifest, study, results)
         if any(result.runs for result in cells):
             sections.append(section(study, cells, docs))
         else:
