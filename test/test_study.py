@@ -707,13 +707,6 @@ def test_what_was_never_measured_and_scales_below_zero_spoil_no_report(study, tm
     assert "| copy | A | `name=one speed=1` | 100 | 2 |" in text
 
 
-def test_runs_that_were_measured_at_other_steps_keep_their_latest_value(study):
-    one, other = np.array([[10, 1.0], [30, 3.0]]), np.array([[20, 5.0], [40, 7.0]])
-    steps, values = study.report.align([one, other])
-    assert steps.tolist() == [20, 30, 40]
-    assert values.tolist() == [[1, 3, 3], [5, 5, 7]]
-
-
 def assert_pictures_are_committed(folder):
     """Byte for byte; of a png the pixels, as its compression depends on the machine's zlib."""
     for file in sorted(folder.iterdir()):
