@@ -115,7 +115,7 @@ def test_a_compiled_run_gives_the_metrics_of_a_run_that_is_not(sweep, tmp_path):
     process = start(tmp_path, *TINY[:-1], *options)
     assert process.returncode == 0, process.stderr
     for name in ("policy", "update"):
-        assert re.search(rf"Compiled the {name} in \d+ s", process.stdout)
+        assert re.search(rf"first call of the {name} compiles it", process.stdout)
     metrics, expected = read_metrics(tmp_path), read_metrics(sweep / "ecac")
     assert metrics.keys() == expected.keys()
     for name in metrics.keys() - {"steps_per_second"}:

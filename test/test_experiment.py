@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from torchrl_ecpo.experiment import MetricsTable, Run, read_metrics
 from torchrl_ecpo.experiment.compare import find_runs, load_comparison
 from torchrl_ecpo.experiment.compare import main as compare
-from torchrl_ecpo.experiment.figures import _draw_curves, smooth
+from torchrl_ecpo.experiment.figures import draw_curve, smooth
 
 PNG = b"\x89PNG\r\n"
 
@@ -135,17 +135,12 @@ def runs(tmp_path):
 
 
 def test_comparison_puts_the_runs_of_a_method_together(runs):
-    comparison = load_comparison(find_runs([runs]), "return", points=3)
+    comparison = load_comparison(find_runs([runs]), "return")
     steps, values = comparison.curves["ecpo"]
     assert steps.tolist() == [10, 20, 30]
     assert values.tolist() == [[1, 3, 5], [1, 5, 7]]
     assert "| ecpo | 2 | 30 | 6.000 ± 1.000 | 5.000 |" in comparison.table()
     assert "| urex | 1 | 30 | 2.000 | 2.000 |" in comparison.table()
-
-
-def test_comparison_takes_the_latest_value_at_or_before_a_step(runs):
-    _, values = load_comparison(find_runs([runs / "urex"]), "return", points=5).curves["urex"]
-    assert values.tolist() == [[0, 0, 1, 1, 2]]
 
 
 def test_comparison_tells_methods_apart_by_what_it_is_told(runs):
@@ -172,9 +167,22 @@ def test_compare_prints_a_table_and_writes_picture_and_curves(runs, capsys):
 def test_a_curve_of_one_point_is_seen():
     panel = Figure().subplots()
     steps, values = np.array([5.0, 10.0]), np.array([[1.0, 2.0], [2.0, 3.0]])
-    curves = {"one": (steps[:1], values[:, :1]), "two": (steps, values)}
-    _draw_curves(panel, curves, dict.fromkeys(curves, "k"), {name: name for name in curves})
+    draw_curve(panel, steps[:1], values[:, :1], color="k", label="one")
+    draw_curve(panel, steps, values, color="k", label="two")
     assert [line.get_marker() for line in panel.lines] == ["o", "None"]
+
+
+def test_the_band_of_a_curve_is_the_standard_error_over_runs():
+    panel, steps = Figure().subplots(), np.array([10.0, 20.0, 30.0])
+    # -2, 0 and 2 around the mean: a sample variance of 8 / 2, a third of it for the mean of three.
+    runs = np.array([[2.0, 1.0, 7.0], [4.0, 1.0, 5.0], [6.0, 1.0, 3.0]])
+    draw_curve(panel, steps, runs, color="k", label="three")
+    (band,) = panel.collections
+    corners = band.get_paths()[0].vertices
+    edges = [{y for x, y in corners if x == step} for step in steps]
+    error = (4 / 3) ** 0.5
+    assert [min(edge) for edge in edges] == pytest.approx([4 - error, 1, 5 - error])
+    assert [max(edge) for edge in edges] == pytest.approx([4 + error, 1, 5 + error])
 
 
 def test_methods_are_told_apart_by_what_is_null_too(runs):

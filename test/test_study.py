@@ -16,15 +16,18 @@ import re
 import signal
 import sys
 import time
+from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
+from matplotlib.image import imread
 from rliable.metrics import probability_of_improvement
 
-STUDY = Path(__file__).parents[1] / "sota-implementations/study"
+ROOT = Path(__file__).parents[1]
+STUDY, COMMITTED = ROOT / "sota-implementations/study", ROOT / "docs"
 MODULES = ("manifest", "records", "results", "scores", "run", "collect", "report")
 
 COUNTER = """
@@ -710,11 +713,116 @@ def test_what_was_never_measured_and_scales_below_zero_spoil_no_report(study, tm
     assert "| copy | A | `name=one speed=1` | 100 | 2 |" in text
 
 
-def test_runs_that_were_measured_at_other_steps_keep_their_latest_value(study):
-    one, other = np.array([[10, 1.0], [30, 3.0]]), np.array([[20, 5.0], [40, 7.0]])
-    steps, values = study.report.align([one, other])
-    assert steps.tolist() == [20, 30, 40]
-    assert values.tolist() == [[1, 3, 3], [5, 5, 7]]
+def assert_pictures_are_committed(folder):
+    """Byte for byte; of a png the pixels, as its compression depends on the machine's zlib."""
+    for file in sorted(folder.iterdir()):
+        committed = COMMITTED / "figures/study" / file.name
+        if file.suffix == ".png":
+            assert np.array_equal(imread(file), imread(committed)), file.name
+        else:
+            assert file.read_bytes() == committed.read_bytes(), file.name
+
+
+def test_the_report_writes_the_committed_sections(study, monkeypatch, tmp_path):
+    """Of the studies that are reported within a second; the slow test has all."""
+    monkeypatch.setattr(study.scores, "REPETITIONS", 2000)
+    manifest, page = study.manifest.read_manifests(), (COMMITTED / "study.md").read_text()
+    assert page.startswith(study.report.INTRODUCTION)
+    quick = ("dm_control", "sensitivity_temperatures")
+    for name, entry in manifest.studies.items():
+        if name in quick or entry.kind == "ranking":
+            section = study.report.section(
+                entry, study.report.read_cells(manifest, entry), tmp_path
+            )
+            assert f"\n\n{section}\n" in page, name
+    assert len(list((tmp_path / "figures/study").iterdir())) == 6
+    assert_pictures_are_committed(tmp_path / "figures/study")
+
+
+@pytest.mark.slow
+def test_make_report_writes_the_committed_page_byte_for_byte(study, monkeypatch, tmp_path):
+    monkeypatch.setattr(study.scores, "REPETITIONS", 2000)
+    assert study.report.main(["--docs", str(tmp_path)]) == 0
+    assert (tmp_path / "study.md").read_bytes() == (COMMITTED / "study.md").read_bytes()
+    folders = (tmp_path / "figures/study", COMMITTED / "figures/study")
+    written, committed = ({file.name for file in folder.iterdir()} for folder in folders)
+    assert written == committed, "a figure of a study that is no more, or is not committed"
+    assert_pictures_are_committed(tmp_path / "figures/study")
+
+
+@pytest.fixture(scope="module")
+def committed(study):
+    """Committed results of a study, by title of the task and method."""
+    manifest = study.manifest.read_manifests()
+
+    @lru_cache
+    def read(name):
+        cells = study.report.read_cells(manifest, manifest.studies[name])
+        return {(result.title, result.cell.method): result for result in cells}
+
+    return read
+
+
+STATED = re.compile(r"(-?[\d,.]+) ± ([\d,.]+)(?: \((.+)\))?")
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/results.md"])
+@pytest.mark.parametrize(
+    ("name", "heading"),
+    [("figure1", r"task \| trajectories"), ("figure2", r"task[^|]*(?:\| runs )?\| ECAC")],
+)
+def test_the_tables_of_results_state_what_is_committed(study, committed, page, name, heading):
+    tables = re.findall(rf"^\| {heading}.*\n(?:\|.*\n)+", (ROOT / page).read_text(), re.M)
+    (lines,) = ([line[2:-2].split(" | ") for line in table.splitlines()] for table in tables)
+    header, _, *rows = lines
+    results = committed(name)
+    assert len(rows) == len({title for title, _ in results})
+    assert {method for _, method in results} <= set(header)
+    for row in rows:
+        title = {"bandit": "10,000-armed bandit"}.get(row[0], row[0])
+        of_task = {method: result for (task, method), result in results.items() if task == title}
+        for column, stated in zip(header[1:], row[1:], strict=True):
+            if column in of_task:
+                assert_stated(study, of_task[column], stated)
+                continue
+            for result in of_task.values():
+                task, steps = result.cell.task, f"{result.cell.steps:,}"
+                count = str(len(result.runs))
+                best = f"{task.best or 0:.3g}"
+                assert stated == {"trajectories": steps, "runs": count}.get(column, best), column
+
+
+def assert_stated(study, result, stated):
+    """Mean and standard error to the digits that are stated, and what is in brackets."""
+    mean, error, brackets = STATED.fullmatch(stated).groups()
+    finals, threshold = result.finals, result.cell.task.solved
+    for text, value in ((mean, finals.mean()), (error, finals.std(ddof=1) / len(finals) ** 0.5)):
+        assert text == f"{value:,.{len(text.partition('.')[2])}f}"
+    if threshold is not None:
+        assert brackets == study.report.scores("", result.scored, threshold)[-2]
+    elif brackets is not None:
+        assert brackets == ", ".join(f"{value:,.0f}" for value in finals)
+
+
+def test_what_the_readme_says_of_the_tables_is_committed(study, committed):
+    text = " ".join((ROOT / "README.md").read_text().split())
+    ecpo_better = {"UREX": 0, "MENT": 0}
+    page = (COMMITTED / "study.md").read_text().split("\n## ")[1]
+    for other, low in re.findall(r"^\| [^|]+ \| (UREX|MENT) \| [\d.]+ \(([\d.]+) to", page, re.M):
+        ecpo_better[other] += float(low) > 0.5
+    assert ecpo_better == {"UREX": 4, "MENT": 5}
+    assert "on four against UREX and on five against MENT" in text
+    areas = {key: study.scores.area(*r.scored).mean() for key, r in committed("figure1").items()}
+    for title, method in areas:
+        assert areas[title, "ECPO"] >= areas[title, method]
+    left, same = committed("figure3_left"), committed("pmd_same_settings")
+    for title in ("Reverse", "ReversedAddition"):
+        assert left[title, "PMD"].finals.max() < 3.4
+        assert study.report.scores("", left[title, "PMD+entropy"].scored, 25)[-2] == "0%"
+    shares = [study.report.scores("", same["Reverse", "PMD+entropy"].scored, 25)[-2]]
+    assert shares == ["20%"]
+    for claim in ("ends below 3.4 on Reverse", "and Reverse in two runs of ten at ECPO's"):
+        assert claim in text
 
 
 # ------------------------------------------------------------------------------------------ scores

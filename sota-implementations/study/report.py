@@ -24,7 +24,8 @@ from scores import (
     steps_to_solve,
 )
 
-from torchrl_ecpo.experiment.figures import plot_comparisons, plot_heat_map
+from torchrl_ecpo.experiment.compare import Curve, align
+from torchrl_ecpo.experiment.figures import plot_comparison, plot_heat_map
 
 DOCS = SCRIPTS.parent / "docs"
 BEST = 3  # settings of a search that are listed
@@ -74,9 +75,6 @@ How to read the tables:
   intervals are too narrow.
 """
 
-Curve = tuple[np.ndarray, np.ndarray]
-"""Steps ``[n]`` and values ``[runs, n]``."""
-
 
 @dataclass(frozen=True)
 class CellResult:
@@ -108,7 +106,8 @@ class CellResult:
             [(point["step"], point[metric]) for point in self.curves[seed] if metric in point]
             for seed in sorted(self.runs)
         ]
-        return align([np.array(pairs) for pairs in points if pairs])
+        measured = [np.array(pairs) for pairs in points if pairs]
+        return align(measured, self.cell.name) if measured else None
 
     @cached_property
     def scored(self) -> Curve | None:
@@ -121,18 +120,10 @@ class CellResult:
         return np.empty(0) if self.scored is None else final(*self.scored)
 
 
-def align(curves: Sequence[np.ndarray]) -> Curve | None:
-    """Runs on common steps, where one that was measured at others keeps its latest value.
-
-    Args:
-        curves: of each run ``[n, 2]``, steps and values; n may differ.
-    """
-    if not curves:
-        return None
-    steps = np.unique(np.concatenate([curve[:, 0] for curve in curves]))
-    steps = steps[steps >= max(curve[0, 0] for curve in curves)]
-    values = [c[np.searchsorted(c[:, 0], steps, side="right") - 1, 1] for c in curves]
-    return steps, np.stack(values)
+def read_cells(manifest: Manifest, study: Study, results: Path = RESULTS) -> list[CellResult]:
+    """What was collected of a study in a folder of results."""
+    collected = Results.read(results / "study" / study.name)
+    return [read_cell(cell, collected) for cell in manifest.cells(study)]
 
 
 def read_cell(cell: Cell, results: Results) -> CellResult:
@@ -366,7 +357,7 @@ def curves_figure(
     metrics = dict.fromkeys(metric or result.cell.task.metric for result in shown)
     y_label = " or ".join(METRIC_LABELS.get(name, name) for name in metrics)
     picture = partial(
-        plot_comparisons,
+        plot_comparison,
         panels,
         labels=labels,
         methods=list(study.methods),
@@ -451,8 +442,7 @@ def write_report(manifest: Manifest, results: Path, docs: Path) -> Path:
     """
     sections, waiting = [], []
     for study in manifest.studies.values():
-        collected = Results.read(results / "study" / study.name)
-        cells = [read_cell(cell, collected) for cell in manifest.cells(study)]
+        cells = read_cells(manifest, study, results)
         if any(result.runs for result in cells):
             sections.append(section(study, cells, docs))
         else:

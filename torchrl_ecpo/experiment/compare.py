@@ -18,7 +18,10 @@ from omegaconf import OmegaConf
 from torchrl_ecpo.experiment.figures import plot_comparison, smooth
 from torchrl_ecpo.experiment.run import METRICS_FILE, read_metrics
 
-__all__ = ["Comparison", "find_runs", "load_comparison", "main"]
+__all__ = ["Comparison", "align", "find_runs", "load_comparison", "main"]
+
+Curve = tuple[np.ndarray, np.ndarray]
+"""Steps ``[n]`` and values ``[runs, n]``."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +29,8 @@ class Comparison:
     """Runs of several methods on one task, on common steps."""
 
     metric: str
-    curves: dict[str, tuple[np.ndarray, np.ndarray]]
-    """By method, the steps ``[n]`` and the values ``[runs, n]``."""
+    curves: dict[str, Curve]
+    """By method."""
 
     def write(self, path: Path) -> Path:
         """Write all curves as one csv table with a row for each point of each run."""
@@ -73,7 +76,6 @@ def load_comparison(
     *,
     by: Sequence[str] = ("loss.name",),
     smoothing: float = 0.0,
-    points: int = 200,
 ) -> Comparison:
     """Read runs and put the curves of each method on common steps.
 
@@ -83,12 +85,12 @@ def load_comparison(
         by: the entries of ``config.yaml`` that tell methods apart.
         smoothing: length of the trailing window over which values are averaged, as a fraction of
             the run; by default they are taken as measured.
-        points: how many steps a curve has; a value is the latest one at or before the step.
 
     Raises:
         KeyError: if a run has no such metric or entry.
+        ValueError: if a run has no value yet, or the runs of a method do not overlap.
     """
-    curves: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+    curves: dict[str, list[np.ndarray]] = {}
     for run in runs:
         columns = read_metrics(run)
         if metric not in columns:
@@ -98,20 +100,37 @@ def load_comparison(
         measured = ~np.isnan(values)
         if not measured.any():
             raise ValueError(f"{run} has no value of {metric!r} yet: leave it out, or wait.")
-        curves.setdefault(method, []).append((steps[measured], smooth(values[measured], smoothing)))
-    common: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    for method, pairs in curves.items():
-        first = max(steps[0] for steps, _ in pairs)
-        last = min(steps[-1] for steps, _ in pairs)
-        if first > last:
-            raise ValueError(
-                f"The runs of {method} have no steps in common: one ends at {last:,.0f}, another "
-                f"begins at {first:,.0f}. Compare runs that overlap."
-            )
-        grid = np.linspace(last, first, points)[::-1]  # the last step, if there is only one point
-        values = [v[np.searchsorted(steps, grid, side="right") - 1] for steps, v in pairs]
-        common[method] = (grid, np.stack(values))
-    return Comparison(metric, common)
+        values = smooth(values[measured], smoothing)
+        curves.setdefault(method, []).append(np.stack([steps[measured], values], axis=1))
+    return Comparison(metric, {method: align(curves[method], method) for method in curves})
+
+
+def align(curves: Sequence[np.ndarray], method: str) -> Curve:
+    """Put runs on the steps at which any was measured; each keeps its latest value in between.
+
+    Args:
+        curves: of each run ``[n, 2]``, steps and values; n may differ.
+        method: whose runs they are, for the message.
+
+    Raises:
+        ValueError: if one run begins after another ends.
+
+    Examples:
+        >>> one, other = np.array([[1, 5.0], [3, 6.0]]), np.array([[2, 7.0], [4, 8.0]])
+        >>> steps, values = align([one, other], "ECPO")
+        >>> steps.tolist(), values.tolist()
+        ([2.0, 3.0], [[5.0, 6.0], [7.0, 7.0]])
+    """
+    first, last = max(c[0, 0] for c in curves), min(c[-1, 0] for c in curves)
+    if first > last:
+        raise ValueError(
+            f"The runs of {method} have no steps in common: one ends at {last:,.0f}, another "
+            f"begins at {first:,.0f}. Compare runs that overlap."
+        )
+    steps = np.unique(np.concatenate([curve[:, 0] for curve in curves]))
+    steps = steps[(first <= steps) & (steps <= last)]
+    values = [c[np.searchsorted(c[:, 0], steps, side="right") - 1, 1] for c in curves]
+    return steps, np.stack(values)
 
 
 def _method(run: Path, by: Sequence[str]) -> str:
@@ -138,7 +157,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--by", nargs="+", default=["loss.name"], help="config entries that tell methods apart"
     )
-    parser.add_argument("--points", type=int, default=200, help="of a curve")
     parser.add_argument("--smoothing", type=float, default=0.0, help="as a fraction of the run")
     parser.add_argument("--title", default="")
     parser.add_argument("--x-label", default="trajectories")
@@ -146,22 +164,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--csv", type=Path, help="also write the curves as a csv table")
     options = parser.parse_args(arguments)
     runs = find_runs(options.directories)
-    comparison = load_comparison(
-        runs,
-        options.metric,
-        by=options.by,
-        smoothing=options.smoothing,
-        points=options.points,
-    )
+    comparison = load_comparison(runs, options.metric, by=options.by, smoothing=options.smoothing)
     print(comparison.table())
     for run in filter(_is_unfinished, runs):
         print(f"not finished, and curves are as long as the shortest one: {run}")
     if options.csv is not None:
         print(f"curves: {comparison.write(options.csv).resolve()}")
+    curves = comparison.curves
+    labels = {method: f"{method} ({len(values)} runs)" for method, (_, values) in curves.items()}
     picture = plot_comparison(
-        comparison.curves,
+        {options.title: curves},
         options.output or options.directories[0] / "comparison.png",
-        title=options.title,
+        labels={options.title: labels},
+        methods=list(curves),
         x_label=options.x_label,
         y_label=options.metric,
     )

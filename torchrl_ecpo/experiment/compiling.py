@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from typing import Any
-
 from torch import nn
 
 __all__ = ["compile_module"]
@@ -17,29 +14,22 @@ def compile_module(module: nn.Module, name: str) -> None:
     are; a copy of it is not compiled. Random numbers are those that it draws uncompiled. On a CPU
     inductor generates C++ code, which needs a compiler; on a GPU it records CUDA graphs (untried).
 
-    The first call compiles, forward and backward pass, and takes from ten seconds to two minutes.
-    It says so, and how long it took. A call with inputs of another kind or shape compiles again.
+    The first call compiles, forward and backward pass, and takes from ten seconds to two minutes;
+    a call with inputs of another kind or shape compiles again.
 
     Args:
         module: whose calls are compiled, not those of its methods.
-        name: of the module, in what the first call prints.
+        name: of the module, in the message that the first call takes long.
 
     Examples:
         >>> import torch
         >>> from torchrl_ecpo.experiment import compile_module
         >>> network = torch.nn.Linear(3, 2)
         >>> compile_module(network, "network")
+        The first call of the network compiles it, which may take some minutes
         >>> list(network.state_dict())
         ['weight', 'bias']
     """
     on_gpu = any(parameter.is_cuda for parameter in module.parameters())
-
-    def first_call(*args: Any, **kwargs: Any) -> Any:
-        print(f"Compiling the {name}, which may take a minute", flush=True)
-        started = time.monotonic()
-        module.compile(options={"fallback_random": True, "triton.cudagraphs": on_gpu})
-        result = module(*args, **kwargs)
-        print(f"Compiled the {name} in {time.monotonic() - started:.0f} s", flush=True)
-        return result
-
-    module._compiled_call_impl = first_call  # where Module.compile puts what it makes
+    module.compile(options={"fallback_random": True, "triton.cudagraphs": on_gpu})
+    print(f"The first call of the {name} compiles it, which may take some minutes", flush=True)

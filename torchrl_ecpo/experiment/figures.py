@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 __all__ = [
+    "draw_curve",
     "plot_comparison",
-    "plot_comparisons",
     "plot_heat_map",
     "plot_learning_curve",
     "smooth",
@@ -33,6 +33,7 @@ METHOD_COLOURS = {
 }
 COLOURS = ("#CC79A7", "#E69F00", "#56B4E9", "#000000", "#0072B2", "#009E73", "#D55E00")
 Curves = Mapping[str, tuple[np.ndarray, np.ndarray]]
+"""By method, the steps ``[n]`` and the values ``[runs, n]``."""
 
 
 def smooth(values: np.ndarray, fraction: float = 0.02) -> np.ndarray:
@@ -78,33 +79,6 @@ def plot_learning_curve(
 
 
 def plot_comparison(
-    curves: Curves,
-    path: Path,
-    *,
-    title: str,
-    x_label: str,
-    y_label: str,
-) -> Path:
-    """Draw mean and standard error of several runs of each method; return ``path``.
-
-    Args:
-        curves: by method, the steps ``[n]`` and the values ``[runs, n]``.
-        path: of the picture; its ending is its format.
-        title: of the picture.
-        x_label: what a step is.
-        y_label: what a value is.
-    """
-    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
-    panel = figure.subplots()
-    labels = {method: f"{method} ({len(values)} runs)" for method, (_, values) in curves.items()}
-    _draw_curves(panel, curves, _colours(curves), labels)
-    panel.set_title(title)
-    panel.set_ylabel(y_label)
-    _decorate(panel, x_label)
-    return _save(figure, path)
-
-
-def plot_comparisons(
     panels: Mapping[str, Curves],
     path: Path,
     *,
@@ -113,7 +87,7 @@ def plot_comparisons(
     x_label: str,
     y_label: str,
 ) -> Path:
-    """Draw a panel like :func:`plot_comparison` for each of several tasks; return ``path``.
+    """Draw mean and standard error of several runs of each method; return ``path``.
 
     Args:
         panels: by title, the curves of a task.
@@ -127,8 +101,11 @@ def plot_comparisons(
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(4.0 * columns, 3.2 * rows), layout="constrained")
     axes = np.atleast_1d(figure.subplots(rows, columns)).flatten()
+    colours = _colours(methods)
     for panel, (title, curves) in zip(axes, panels.items(), strict=False):
-        _draw_curves(panel, curves, _colours(methods), labels[title], fontsize="small")
+        for method, curve in curves.items():
+            draw_curve(panel, *curve, color=colours[method], label=labels[title][method])
+        panel.legend(frameon=False, fontsize="small")
         panel.set_title(title)
         panel.xaxis.set_major_formatter(EngFormatter(sep=""))
         _decorate(panel, x_label)
@@ -137,6 +114,26 @@ def plot_comparisons(
     for panel in axes[len(panels) :]:
         panel.set_visible(False)
     return _save(figure, path)
+
+
+def draw_curve(
+    panel: Axes, steps: np.ndarray, values: np.ndarray, *, color: str, label: str
+) -> None:
+    """Draw the mean over runs and, of two or more, a band of its standard error.
+
+    Args:
+        panel: where to draw.
+        steps: ``[n]``.
+        values: ``[runs, n]``.
+        color: of line and band.
+        label: of the line, in the legend.
+    """
+    mean, runs = values.mean(axis=0), len(values)
+    marker = "o" if len(steps) == 1 else None  # a line needs two points
+    panel.plot(steps, mean, color=color, label=label, marker=marker)
+    if runs > 1:
+        error = values.std(axis=0, ddof=1) / np.sqrt(runs)
+        panel.fill_between(steps, mean - error, mean + error, color=color, alpha=0.2, lw=0)
 
 
 def plot_heat_map(
@@ -185,24 +182,6 @@ def _colours(methods: Collection[str]) -> dict[str, str]:
     taken = {METHOD_COLOURS.get(method.lower()) for method in methods}
     others = itertools.cycle([c for c in COLOURS if c not in taken] or COLOURS)
     return {method: METHOD_COLOURS.get(method.lower()) or next(others) for method in methods}
-
-
-def _draw_curves(
-    panel: Axes,
-    curves: Curves,
-    colours: Mapping[str, str],
-    labels: Mapping[str, str],
-    fontsize: str = "medium",
-) -> None:
-    for method, (steps, values) in curves.items():
-        mean, runs = np.nanmean(values, axis=0), len(values)
-        marker = "o" if np.isfinite(mean).sum() == 1 else None  # a line needs two points
-        panel.plot(steps, mean, color=colours[method], label=labels[method], marker=marker)
-        if runs > 1:
-            error = np.nanstd(values, axis=0, ddof=1) / np.sqrt(runs)
-            low, high = mean - error, mean + error
-            panel.fill_between(steps, low, high, color=colours[method], alpha=0.2, lw=0)
-    panel.legend(frameon=False, fontsize=fontsize)
 
 
 def _save(figure: Figure, path: Path) -> Path:
