@@ -110,7 +110,9 @@ def check_batch(batch, num_groups, group_size, *, padded_with_zeros=True):
     ids = batch["collector", "traj_ids"]
     assert (ids == ids[..., :1])[mask].all()
     assert ids[..., 0].unique().numel() == num_groups * group_size
-    assert not (padded_with_zeros and batch["left"][~mask].any())
+    if padded_with_zeros:
+        for key in ("left", "group", ("collector", "traj_ids")):
+            assert not batch[key][~mask].any()
 
 
 @pytest.mark.parametrize(("num_groups", "played"), [(2, 2), (6, 2), (1, 1)])
@@ -259,6 +261,24 @@ def test_what_a_batch_keeps():
     full = {("next", key) for key in ("observation", "group", "is_init")}
     keys = [set(batch.keys(True, True)) for batch in batches]
     assert keys == [shared | outcome | {"features"}, shared | outcome | full]
+
+
+def test_what_is_private_is_left_out():
+    """A key or a part of it that begins with an underscore, whoever wrote it."""
+
+    class Hiding(Countdown):
+        def _observe(self, group, left, done):
+            return super()._observe(group, left, done).update({"_cache": left, "a": {"_b": left}})
+
+    hide = TensorDictModule(lambda x: x, ["observation"], ["_seen"])
+    policy = TensorDictSequential(hide, linear_policy())
+    for compact_obs in (True, False):
+        collector = TrajectoryGroupCollector(
+            Hiding(), policy, num_groups=2, group_size=3, compact_obs=compact_obs
+        )
+        keys = [key if isinstance(key, tuple) else (key,) for key in collector.rollout().keys(True)]
+        assert ("observation",) in keys
+        assert not [key for key in keys if any(part.startswith("_") for part in key)]
 
 
 def nested_policy(read):
