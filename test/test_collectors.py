@@ -24,15 +24,24 @@ from torchrl.data import (
 )
 from torchrl.envs import (
     EnvBase,
+    GymEnv,
     InitTracker,
     RenameTransform,
     RewardSum,
     StepCounter,
     TransformedEnv,
 )
-from torchrl.modules import LSTMModule, RandomPolicy, get_env_transforms_from_module
+from torchrl.modules import (
+    LSTMModule,
+    ProbabilisticActor,
+    RandomPolicy,
+    get_env_transforms_from_module,
+)
+from torchrl.trainers import Trainer, UpdateWeights
 
+from torchrl_ecpo import ECPOLoss
 from torchrl_ecpo.collectors import TrajectoryGroupCollector, shut_down
+from torchrl_ecpo.envs import GroupedEnv
 from torchrl_ecpo.envs._groups import GroupIdAllocator
 from torchrl_ecpo.groups import TrajectoryGroupSampler, pack_groups, unpack_groups
 
@@ -357,21 +366,46 @@ def test_ways_to_give_weights():
         Countdown(), policy_factory=linear_policy, num_groups=2, group_size=3
     )
     batches = iter(collector)
-    for i, name in enumerate(("policy", "weights", "weights_dict")):
-        other = linear_policy(1.0 + i)
-        weights = TensorDict.from_module(other).data
-        given = {"policy": other, "weights": weights, "weights_dict": {"policy": weights}}
-        collector.update_policy_weights_(**{name: given[name]})
+    others = [linear_policy(weight) for weight in (1.0, 2.0, 3.0)]
+    weights = [TensorDict.from_module(other).data for other in others]
+    given = [{"policy_or_weights": others[0]}, {"policy_or_weights": weights[1]}]
+    given.append({"weights_dict": {"policy": weights[2]}})
+    for options, expected in zip(given, (1.0, 2.0, 3.0), strict=True):
+        collector.update_policy_weights_(**options)
         batch = next(batches)
-        assert (batch["action"][batch["collector", "mask"]] == 1.0 + i).all()
-    with pytest.raises(ValueError, match="weights of one policy"):
-        collector.update_policy_weights_(other, weights=weights)
-    with pytest.raises(ValueError, match="weights of one policy"):
-        collector.update_policy_weights_(weights_dict={"critic": weights})
+        assert (batch["action"][batch["collector", "mask"]] == expected).all()
+    for wrong in ({"policy_or_weights": others[0], **given[2]}, {"weights_dict": {"critic": 0}}):
+        with pytest.raises(ValueError, match="weights of one policy"):
+            collector.update_policy_weights_(**wrong)
     with pytest.raises(ValueError, match="policy_factory"):
         collector.update_policy_weights_()
     random = TrajectoryGroupCollector(Countdown(), num_groups=2, group_size=3)
     random.update_policy_weights_()  # as trainers do
+
+
+def test_trainers_take_it():
+    env = GroupedEnv(
+        lambda: GymEnv("CartPole-v1", categorical_action_encoding=True), num_groups=2, group_size=3
+    )
+    network = TensorDictModule(nn.Linear(4, 2), ["observation"], ["logits"])
+    actor = ProbabilisticActor(
+        network, ["logits"], distribution_class=torch.distributions.Categorical,
+        return_log_prob=True,
+    )  # fmt: skip
+    collector = TrajectoryGroupCollector(env, actor, num_groups=2, group_size=3, total_frames=500)
+    loss_module = ECPOLoss(actor, tau=1.0)
+    with pytest.warns(FutureWarning, match="OptimizationStepper"):
+        trainer = Trainer(
+            collector=collector, total_frames=500, frame_skip=1, optim_steps_per_batch=1,
+            loss_module=loss_module, optimizer=torch.optim.Adam(loss_module.parameters()),
+            progress_bar=False, seed=0,
+        )  # fmt: skip
+    UpdateWeights(collector, 1).register(trainer)
+    before = actor[0].module.weight.clone()
+    trainer.train()
+    assert trainer.collected_frames >= 500
+    assert (actor[0].module.weight != before).any()
+    assert_close(collector.policy[0].module.weight, actor[0].module.weight)
 
 
 def test_seed_postproc_and_hooks():

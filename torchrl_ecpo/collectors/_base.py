@@ -11,7 +11,7 @@ from torch import nn
 from torchrl.collectors import BaseCollector
 from torchrl.data import ReplayBuffer
 
-from torchrl_ecpo.collectors.workers import Workers
+from torchrl_ecpo.collectors.workers import Workers, spawn_seeds
 from torchrl_ecpo.groups import MASK_KEY, unpack_groups
 
 
@@ -72,28 +72,21 @@ class PlayerCollector(BaseCollector):
                 yield None
 
     def update_policy_weights_(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self,
-        policy_or_weights: TensorDictBase | nn.Module | None = None,
-        *,
-        weights: TensorDictBase | None = None,
-        policy: nn.Module | None = None,
-        weights_dict: dict[str, TensorDictBase] | None = None,
+        self, policy_or_weights: Any = None, *, weights_dict: dict[str, Any] | None = None
     ) -> None:
         """Copy the weights of the policy, or those given, to the reference that acts.
 
-        A worker takes them before its next batch.
+        They count from the next batch. With workers that do not wait, that is the next one begun.
 
         Args:
             policy_or_weights: the weights, or a module that has them. Default: the policy.
-            weights: the same, as TorchRL also calls them.
-            policy: the same.
-            weights_dict: the same, ``{"policy": weights}``.
+            weights_dict: the same as TorchRL's trainers may give it, ``{"policy": weights}``.
         """
-        given = (policy_or_weights, weights, policy, *(weights_dict or {}).values())
-        sources = [source for source in given if source is not None]
-        if len(sources) > 1 or {*(weights_dict or {})} - {"policy"}:
-            raise ValueError("update_policy_weights_ takes the weights of one policy, and once.")
-        source = sources[0] if sources else self._learner
+        if weights_dict is not None:
+            if policy_or_weights is not None or [*weights_dict] != ["policy"]:
+                raise ValueError("update_policy_weights_ takes the weights of one policy, once.")
+            policy_or_weights = weights_dict["policy"]
+        source = self._learner if policy_or_weights is None else policy_or_weights
         if isinstance(source, nn.Module):
             own: Any = TensorDict.from_module(source)
             source = own.data
@@ -103,10 +96,10 @@ class PlayerCollector(BaseCollector):
             self._workers.set_weights(source)
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
-        """Seed the environments, one after another; return the seed for the next one."""
-        for worker in range(len(self._workers)):
-            seed = self._workers.call_one(worker, "set_seed", seed, static_seed)
-        return seed
+        """Seed the environments, those of several workers differently; return a seed to go on."""
+        several = len(self._workers) > 1
+        seeds = spawn_seeds(seed, len(self._workers)) if several else [seed]
+        return self._workers.call("set_seed", seeds, [static_seed] * len(seeds))[-1]
 
     def state_dict(self) -> OrderedDict[str, Any]:
         """The policy, the environment and the counters, between two batches.

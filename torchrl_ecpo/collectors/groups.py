@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any
 
 from tensordict import TensorDict, TensorDictBase, pad
+from torch import nn
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
@@ -158,7 +159,8 @@ class TrajectoryGroupCollector(PlayerCollector):
         self._has_factory = "policy_factory" in options
         is_here = backend == "direct"
         options |= {"num_groups": share, "group_size": group_size}
-        options["policy"] = deepcopy(policy) if is_here else policy  # what travels is a copy
+        is_copied = is_here and isinstance(policy, nn.Module)  # what travels is a copy
+        options["policy"] = deepcopy(policy) if is_copied else policy
         players = [partial(GroupPlayer, maker, **options) for maker in makers]
         self._workers = Workers(
             players, backend, sync=is_here or bool(sync), **(backend_options or {})
@@ -169,13 +171,15 @@ class TrajectoryGroupCollector(PlayerCollector):
     def rollout(self) -> TensorDictBase:
         """Collect a batch of groups `[G, K, T]`, which is not counted nor written anywhere."""
         played = self._workers.play()
-        num_steps = max(batch.shape[-1] for _, batch in played)
-        parts = []
         for worker, batch in played:  # each counts its trajectories for itself
             ids = batch[TRAJECTORY_KEY] * len(self._workers) + worker
             batch.set(TRAJECTORY_KEY, ids * batch[MASK_KEY])
-            parts.append(pad(batch, [0, 0, 0, 0, 0, num_steps - batch.shape[-1]]))
-        groups: Any = parts[0] if len(parts) == 1 else TensorDict.cat(parts)
+        if len(played) == 1:
+            return played[0][1]
+        num_steps = max(batch.shape[-1] for _, batch in played)
+        padding = [[0, 0, 0, 0, 0, num_steps - batch.shape[-1]] for _, batch in played]
+        parts = [pad(batch, own) for (_, batch), own in zip(played, padding, strict=True)]
+        groups: Any = TensorDict.cat(parts)
         return groups
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -18,29 +17,12 @@ from torchrl_ecpo.collectors.workers import Workers
 __all__ = ["SupervisedAsyncCollector", "SupervisedSyncCollector", "shut_down"]
 
 
-class _FramePlayer:
-    """A collector of TorchRL's, batch by batch."""
+class _FramePlayer(Collector):
+    """TorchRL's collector, called as the players are."""
 
-    def __init__(self, make: Any, **options: Any) -> None:
-        self.collector = Collector(make, **options)
-        self._batches = iter(self.collector)
-
-    def play(self, weights: TensorDictBase | None) -> Any:
-        if weights is not None:
-            self.collector.update_policy_weights_(weights)
-        return next(self._batches)
-
-    def set_seed(self, seed: int, static_seed: bool) -> int:
-        return self.collector.set_seed(seed, static_seed)
-
-    def state_dict(self) -> OrderedDict[str, Any]:
-        return self.collector.state_dict()
-
-    def load_state_dict(self, state_dict: OrderedDict[str, Any]) -> None:
-        self.collector.load_state_dict(state_dict)
-
-    def close(self) -> None:
-        self.collector.shutdown()
+    play = Collector.next
+    set_weights = Collector.update_policy_weights_
+    close = Collector.shutdown
 
 
 class SupervisedSyncCollector(PlayerCollector):

@@ -1,8 +1,7 @@
-"""Players in processes of their own, on this machine or in a Ray cluster, looked after.
+"""Players in this process, in others of this machine or of a Ray cluster, looked after.
 
-A player is what collects: it has ``play(weights)``, which takes new weights, if any, and returns a
-batch, and ``close()``. A worker does one thing after another, so that the weights of its player
-never change within a batch.
+A player is what collects: ``play()`` returns a batch, ``set_weights(weights)`` takes new weights
+between two batches, ``close()`` ends it. A worker does one thing after another.
 """
 
 from __future__ import annotations
@@ -36,6 +35,16 @@ except ImportError:  # an extra
     ray: Any = None
 
 
+def spawn_seeds(seed: int, count: int) -> list[int]:
+    """Seeds of streams that differ from each other, and from those of other seeds.
+
+    Examples:
+        >>> len({*spawn_seeds(0, 2), *spawn_seeds(1, 2)})
+        4
+    """
+    return np.random.SeedSequence(seed).generate_state(count).tolist()
+
+
 class Workers:
     """Players in this process, in processes of their own, or in the actors of a Ray cluster.
 
@@ -62,15 +71,15 @@ class Workers:
         self._sync = sync
         self._weights: list[TensorDictBase | None] = [None] * len(makers)
         self._playing: dict[Future[Any], int] = {}
+        if backend == "ray" and ray is None:
+            raise ModuleNotFoundError("backend='ray' needs the extra 'ray' of this package.")
         self._has_cluster = backend == "ray" and not ray.is_initialized()
         if self._has_cluster:
             ray.init(**(ray_init_config or {}))
         make = {"direct": _Here, "process": _Process, "ray": partial(_Actor, remote_configs or {})}
         self._workers: list[Any] = [make[backend]() for _ in makers]
-        # Workers draw from streams of their own, which follow from this process's seed.
-        seeds = np.random.SeedSequence(torch.initial_seed()).generate_state(len(makers))
         try:
-            self.call("start", makers, seeds.tolist())
+            self.call("start", makers, spawn_seeds(torch.initial_seed(), len(makers)))
         except BaseException:
             self._leave()
             raise
@@ -84,8 +93,11 @@ class Workers:
         return len(self._workers)
 
     def set_weights(self, weights: TensorDictBase) -> None:
-        """Give all players these weights before whatever they do next."""
-        self._weights = [weights.detach().clone()] * len(self)
+        """Give all players these weights before whatever they do next, or at once."""
+        if self._workers[0].is_idle:
+            self.call("set_weights", [weights])
+        else:
+            self._weights = [weights.detach().clone()] * len(self)
 
     def play(self) -> list[tuple[int, Any]]:
         """Return all workers' batches, or that of the first one to finish, each with its worker."""
@@ -107,10 +119,6 @@ class Workers:
         rows = list(zip(*arguments, strict=True)) or [()] * len(self)
         futures = [self._submit(worker, name, *row) for worker, row in enumerate(rows)]
         return [self._result(worker, future) for worker, future in enumerate(futures)]
-
-    def call_one(self, worker: int, name: str, *arguments: Any) -> Any:
-        """Call a method of one player."""
-        return self._result(worker, self._submit(worker, name, *arguments))
 
     def stop(self, timeout: float | None = None) -> None:
         """Close the players and end the workers, by force after `timeout` seconds (default: 5)."""
@@ -151,7 +159,7 @@ class Workers:
 
 
 class _Host:
-    """What a worker has: a player."""
+    """What a worker has: a player, with random numbers from a stream of its own."""
 
     player: Any
 
@@ -167,28 +175,36 @@ class _Host:
         return getattr(self.player, name)(*arguments)
 
 
-class _Here(_Host):
-    """This process, which has done a thing when it is asked for the result."""
+class _Worker:
+    """What hosts of all kinds do, unless they say otherwise."""
 
-    death = ()
+    death: Any = ()
+    is_idle = False  # as far as is known
+
+    def read(self, answer: Any) -> Any:
+        return answer
+
+    def kill(self) -> None:
+        """End at once."""
+
+
+class _Here(_Worker, _Host):
+    """This process, which has done a thing before it is asked for the result."""
+
+    is_idle = True
 
     def submit(self, weights: TensorDictBase | None, name: str, *arguments: Any) -> Future[Any]:
         future: Future[Any] = Future()
         if name == "start":  # the random numbers are this process's
             self.player = arguments[0]()
             future.set_result(None)
-        else:
+            return future
+        self.is_idle = False
+        try:
             future.set_result(self.call(weights, name, *arguments))
+        finally:
+            self.is_idle = True
         return future
-
-    def read(self, answer: Any) -> Any:
-        return answer
-
-    def cause(self) -> str:
-        return "ended"
-
-    def kill(self) -> None:
-        pass
 
 
 _host = _Host()  # of a worker process
@@ -212,7 +228,7 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-class _Process:
+class _Process(_Worker):
     """A worker process of this machine."""
 
     death = BrokenProcessPool
@@ -248,7 +264,7 @@ class _Process:
         self.process.join()
 
 
-class _Actor:
+class _Actor(_Worker):
     """An actor of a Ray cluster."""
 
     def __init__(self, needs: dict[str, Any]) -> None:
@@ -257,9 +273,6 @@ class _Actor:
 
     def submit(self, *request: Any) -> Future[Any]:
         return self.actor.call.remote(*request).future()
-
-    def read(self, answer: Any) -> Any:
-        return answer
 
     def cause(self) -> str:
         """Ray's own error, from which this one is raised, says more."""
