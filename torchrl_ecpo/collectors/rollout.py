@@ -161,7 +161,7 @@ class GroupPlayer:
             for _ in range(self.num_groups * self.group_size // self.env.batch_size.numel()):
                 groups.append(self._play_round(steps, sum(map(len, groups))))
         assert self._flow is not None
-        batch = _pad(steps, [*self._flow.kept, *self._flow.decided], sum(map(len, groups)))
+        batch = _pad(steps, self._flow, sum(map(len, groups)))
         mask = batch[MASK_KEY]
         ids = torch.arange(self._next_id, self._next_id + len(mask), device=mask.device)
         self._next_id += len(mask)
@@ -181,10 +181,9 @@ class GroupPlayer:
             acted = self._act(seen, rows)
             step = self.env.step(self._set_inputs(root, acted, places))
             flow = self._flow = self._flow or self._trace_flow(step, acted)
-            active = None if places is None else rows
-            values = [_choose(step.get(key), active, step.ndim) for key in flow.kept]
-            values += [_choose(acted.get(key), None, acted.ndim) for key in flow.decided]
-            steps.append(_Step(time, rows + first, values))
+            kept = [step.get(key).flatten(0, step.ndim - 1) for key in flow.kept]
+            decided = [acted.get(key).flatten(0, acted.ndim - 1) for key in flow.decided]
+            steps.append(_Step(first, time, rows, kept, decided))
             done = step.get(("next", "done")).reshape(-1).index_select(0, rows)
             going_on = done.logical_not_().nonzero().squeeze(-1)
             if not len(going_on):
@@ -283,13 +282,17 @@ class _Flow(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """What is recorded of a step of some trajectories."""
+    """What is recorded of a step in `N` rows; which of them count is sorted out at the end."""
 
+    first: int
+    """The trajectory in row 0."""
     time: int
-    trajectories: Tensor
-    """`[n]`"""
-    values: list[Tensor]
-    """`[n, *]` each: what is kept, then what is decided."""
+    rows: Tensor
+    """Those that had not ended, `[n]`."""
+    kept: list[Tensor]
+    """`[N, *]` each."""
+    decided: list[Tensor]
+    """`[n, *]` each."""
 
 
 def _acted_on(env: EnvBase) -> list[NestedKey]:
@@ -379,14 +382,21 @@ def _show(
     return TensorDict(seen, batch_size=rows.shape, device=root.device)
 
 
-def _pad(steps: list[_Step], keys: list[NestedKey], num_trajectories: int) -> TensorDictBase:
-    """Lay out trajectories as `[N, T]`, with their mask and zeros after their ends."""
+def _pad(steps: list[_Step], flow: _Flow, num_trajectories: int) -> TensorDictBase:
+    """Lay out trajectories as `[G * K, T]`, with their mask and zeros after their ends."""
     shape = torch.Size([num_trajectories, max(step.time for step in steps) + 1])
-    place = torch.cat([step.trajectories * shape[1] + step.time for step in steps])
+    place = torch.cat([(step.first + step.rows) * shape[1] + step.time for step in steps])
     mask = torch.zeros(shape.numel(), dtype=torch.bool, device=place.device)
     batch = TensorDict({MASK_KEY: mask.index_fill_(0, place, True).view(shape)}, batch_size=shape)
-    for key, values in zip(keys, zip(*(step.values for step in steps), strict=True), strict=True):
-        value = torch.cat(values)
+
+    def write(key: NestedKey, value: Tensor) -> None:
         padded = value.new_zeros(len(mask), *value.shape[1:]).index_copy_(0, place, value)
         batch.set(key, padded.view(*shape, *value.shape[1:]))
+
+    num_rows = len(steps[0].rows)
+    source = torch.cat([step.rows + i * num_rows for i, step in enumerate(steps)])
+    for key, *values in zip(flow.kept, *(step.kept for step in steps), strict=True):
+        write(key, torch.cat(values).index_select(0, source))
+    for key, *values in zip(flow.decided, *(step.decided for step in steps), strict=True):
+        write(key, torch.cat(values))
     return batch
