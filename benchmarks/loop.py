@@ -43,6 +43,7 @@ from torchrl.modules import ProbabilisticActor
 
 from torchrl_ecpo import ECPOLoss
 from torchrl_ecpo.collectors import TrajectoryGroupCollector
+from torchrl_ecpo.collectors.rollout import GroupPlayer
 from torchrl_ecpo.envs import AlgorithmicEnv
 from torchrl_ecpo.functional import lifted_log_weights, mean_seeking_projection
 from torchrl_ecpo.modules import DistinctHistoryLSTM, TupleCategorical, make_tuple_policy
@@ -260,8 +261,8 @@ def take_turns(loops: list[Iteration], repeats: int) -> tuple[list[float], ...]:
 
 # What is timed in a step of collecting. The rest of a part is what is left of the whole one.
 TIMED: dict[str, list[tuple[Any, str]]] = {
-    "collecting": [(TrajectoryGroupCollector, "rollout"), (sys.modules[__name__], "collect")],
-    "policy": [(TrajectoryGroupCollector, "_act")],
+    "collecting": [(GroupPlayer, "play"), (sys.modules[__name__], "collect")],
+    "policy": [(GroupPlayer, "_act")],
     "LSTM": [(DistinctHistoryLSTM, "_run")],
     "distribution": [
         (TupleCategorical, name) for name in ("sample", "log_prob", "sample_and_log_prob")

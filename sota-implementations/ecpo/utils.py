@@ -86,8 +86,7 @@ def make_collector(config: DictConfig, task: Task) -> TrajectoryGroupCollector:
     of a batch unless each makes batches of its own.
     """
     options: Any = OmegaConf.to_container(config.collector, resolve=True)
-    is_shared = options.get("sync", options["backend"] == "ray")
-    num_groups = config.num_groups // (options["num_collectors"] if is_shared else 1)
+    num_groups = config.num_groups // (options["num_collectors"] if options.get("sync") else 1)
     collector = TrajectoryGroupCollector(
         task.env if is_single(config) else partial(task.make_env, num_groups=num_groups),
         task.actor,
