@@ -88,6 +88,7 @@ def test_seeds_are_other_problems_and_schedules_and_ablations_are_options(sweep,
     assert set(without_entropy["kl_to_reference"]) == {0}, "one step a lift: no projection"
 
 
+@pytest.mark.slow  # each of the two processes imports torch
 def test_a_sweep_over_two_processes_gives_the_metrics_of_single_runs(sweep, tmp_path):
     run_ecpo(
         tmp_path,

@@ -1,7 +1,7 @@
 """The study: its manifests, the queue that makes the runs, and what becomes of their results.
 
-The queue starts a script that counts, with the files and the checkpoint of a real run; one slow
-test has it start the real one.
+The queue starts a script that counts, with the files and the checkpoint of a real run; a slow test
+has it start the real one.
 """
 
 from __future__ import annotations
@@ -281,6 +281,7 @@ def test_seeds_are_stacked_and_what_has_begun_goes_on_as_it_was(study, run, tmp_
     assert stack.command[2:6] == ["name=one", "speed=1.0", "seeds=[1,3]", "total_frames=4"]
 
 
+@pytest.mark.slow  # real runs, of which the queue starts each in a new interpreter
 def test_a_stack_is_made_continued_and_collected(study, run, tmp_path):
     options = "env.num_actions=30 group_size=5 optim.lr=0.1"
     cell = {"tasks": ["small"], "methods": {"ECPO": options}, "seeds": "1-3"}
@@ -375,7 +376,7 @@ def fork_queue(study, path, runs):
     process = os.fork()
     if process:
         return process
-    os.environ["COUNTER_SLEEP"] = "0.2"
+    os.environ["COUNTER_SLEEP"] = "0.4"
     try:
         status = study.run.main(
             ["--manifest", str(path), "--runs", str(runs), "--workers", "2"],

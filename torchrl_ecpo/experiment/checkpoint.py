@@ -313,7 +313,7 @@ def _check_options(options: DictConfig) -> None:
 
 
 def _differences(saved: dict[str, Any], present: dict[str, Any]) -> list[str]:
-    """What differs between two configurations, but for `FREE_OPTIONS` and a total that has grown."""
+    """What differs in two configurations, but for `FREE_OPTIONS` and a total that has grown."""
     old, new = (
         flatten({name: value for name, value in config.items() if name not in FREE_OPTIONS})
         for config in (saved, present)
