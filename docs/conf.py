@@ -38,8 +38,11 @@ napoleon_use_ivar = True
 nitpicky = True
 # Types of other projects, and the short names by which annotations call them.
 nitpick_ignore_regex = [
-    ("py:.*", r"(collections|numpy|omegaconf|pathlib|tensordict|torch|torchrl|types|typing)\..*"),
-    ("py:(class|exc)", "CheckpointError|EnvBase|NestedKey|Tensor|TensorDictBase"),
+    (
+        "py:.*",
+        r"(collections|matplotlib|numpy|omegaconf|pathlib|tensordict|torch|torchrl|types|typing)\..*",
+    ),
+    ("py:(class|exc)", "Axes|CheckpointError|EnvBase|NestedKey|Tensor|TensorDictBase"),
     ("py:class", r"torchrl_ecpo\..*\._.+"),  # what is private has no page
     ("py:attr", "in_keys|loss_mask_key|out_keys"),  # of TorchRL's LossModule
 ]

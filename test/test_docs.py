@@ -205,15 +205,6 @@ def test_the_page_of_equations_names_tests_that_exist():
         assert set(re.findall(r"`(test_\w+)`", row)) <= defined, row
 
 
-def test_the_site_builds_without_a_warning(tmp_path):
-    """Sphinx also looks for the functions and classes that pages name, and for lost pages."""
-    options = ["-W", "--keep-going", "-q", "-b", "html", str(DOCS), str(tmp_path)]
-    build = subprocess.run(
-        [sys.executable, "-m", "sphinx", *options], capture_output=True, text=True
-    )
-    assert build.returncode == 0, build.stderr
-
-
 def test_a_wrong_option_is_noticed():
     script = ROOT / "sota-implementations/ecpo/ecpo.py"
     compose_command(script, " --multirun loss=ecpo,ment seed='range(0,2)' # a comment")

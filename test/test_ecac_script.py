@@ -6,7 +6,6 @@ import itertools
 import json
 import math
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+from processes import run_script
 from tensordict import TensorDict
 
 from torchrl_ecpo.experiment import read_metrics
@@ -37,8 +37,8 @@ LOSSES = ("ecac", "pmd_ac", "sac", "sac_score", "td3", "ddpg")
 def start(directory, *overrides):
     flags = [override for override in overrides if override.startswith("--")]
     options = [override for override in overrides if override not in flags]
-    command = [sys.executable, str(SCRIPT / "ecac.py"), *flags, *options]
-    return subprocess.run(command, capture_output=True, text=True, cwd=directory, check=False)
+    afresh = any(option in ("compile=true", "collector=ray") for option in options)
+    return run_script(directory, SCRIPT / "ecac.py", *flags, *options, afresh=afresh)
 
 
 def tiny(overrides):

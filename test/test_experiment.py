@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from torchrl_ecpo.experiment import MetricsTable, Run, read_metrics
 from torchrl_ecpo.experiment.compare import find_runs, load_comparison
 from torchrl_ecpo.experiment.compare import main as compare
-from torchrl_ecpo.experiment.figures import draw_curve, smooth
+from torchrl_ecpo.experiment.figures import draw_curve
 
 PNG = b"\x89PNG\r\n"
 
@@ -84,7 +84,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_is_recorded(tmp_path, value
     assert len(read_metrics(tmp_path)["step"]) == 2
 
 
-@pytest.mark.parametrize("backend", ["tensorboard", "wandb"])
+@pytest.mark.parametrize("backend", ["tensorboard", pytest.param("wandb", marks=pytest.mark.slow)])
 def test_other_loggers_come_beside_the_record(tmp_path, backend, monkeypatch):
     monkeypatch.setenv("WANDB_SILENT", "true")
     with make_run(tmp_path, make_config(backend)) as run:
@@ -114,12 +114,6 @@ def test_table_in_memory_and_on_disk_agree(tmp_path):
     table.log_metrics({"b": 2.5}, step=2)
     assert table.rows == [{"step": 1, "a": 1.5}, {"step": 2, "b": 2.5}]
     assert (tmp_path / "metrics.csv").read_text().split() == ["step,a,b", "1,1.5,", "2,,2.5"]
-
-
-def test_smooth_is_a_trailing_mean():
-    values = np.array([1.0, 3.0, 5.0, 11.0])
-    assert smooth(values, 0.5).tolist() == [1.0, 2.0, 4.0, 8.0]
-    assert smooth(values, 0.0).tolist() == values.tolist()
 
 
 @pytest.fixture

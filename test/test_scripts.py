@@ -6,13 +6,13 @@ import importlib
 import json
 import math
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import torch
 from omegaconf import OmegaConf
+from processes import run_script
 from tensordict import TensorDict
 
 from torchrl_ecpo.experiment import compare, read_metrics
@@ -22,16 +22,16 @@ ECPO = ROOT / "sota-implementations/ecpo/ecpo.py"
 TINY = ("env.num_actions=30", "total_trajectories=60", "group_size=10")
 
 
-def start(directory, *overrides):
+def start(directory, *overrides, afresh=False):
     flags = [override for override in overrides if override.startswith("--")]
     options = [override for override in overrides if override not in flags]
     tiny = () if any(option.startswith("env=") for option in options) else TINY
-    command = [sys.executable, str(ECPO), *flags, *tiny, *options]
-    return subprocess.run(command, capture_output=True, text=True, cwd=directory, check=False)
+    afresh = afresh or "collector=ray" in options or "hydra/launcher=joblib" in options
+    return run_script(directory, ECPO, *flags, *tiny, *options, afresh=afresh)
 
 
-def run_ecpo(directory, *overrides):
-    process = start(directory, *overrides)
+def run_ecpo(directory, *overrides, afresh=False):
+    process = start(directory, *overrides, afresh=afresh)
     assert process.returncode == 0, process.stderr
 
 
@@ -88,6 +88,7 @@ def test_seeds_are_other_problems_and_schedules_and_ablations_are_options(sweep,
     assert set(without_entropy["kl_reference_policy"]) == {0}, "one step a lift: no projection"
 
 
+@pytest.mark.slow  # each of the two processes imports torch
 def test_a_sweep_over_two_processes_gives_the_metrics_of_single_runs(sweep, tmp_path):
     run_ecpo(
         tmp_path,
@@ -140,22 +141,16 @@ def test_every_kind_of_task_runs(tmp_path, options):
     assert all(math.isfinite(loss) for loss in metrics["loss_actor"])
 
 
-def test_compare_from_the_command_line(sweep):
-    module = "torchrl_ecpo.experiment.compare"
-    command = [sys.executable, "-m", module, str(sweep), "--metric", "expected_reward"]
-    process = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert "| ecpo | 1 | 60 |" in process.stdout, process.stderr
-    assert (sweep / "comparison.png").exists()
-    assert "not finished" not in process.stdout
-
-
 def test_compare_names_runs_that_have_not_finished(sweep, tmp_path, capsys):
     for loss in ("ecpo", "ment", "urex"):
         shutil.copytree(sweep / loss, tmp_path / loss)
     (tmp_path / "ment/summary.json").write_text('{"finished": false}')
     (tmp_path / "urex/summary.json").unlink()
     compare.main([str(tmp_path), "--metric", "expected_reward"])
-    named = [line for line in capsys.readouterr().out.splitlines() if "not finished" in line]
+    output = capsys.readouterr().out
+    assert "| ecpo | 1 | 60 |" in output
+    assert (tmp_path / "comparison.png").exists()
+    named = [line for line in output.splitlines() if "not finished" in line]
     assert [Path(line.split()[-1]).name for line in named] == ["ment", "urex"]
 
 
@@ -166,7 +161,8 @@ def test_a_compiled_run_gives_the_metrics_of_a_run_that_is_not(tmp_path, env):
     size = {"bandit": TINY, "gym": ("total_trajectories=96", "env=gym", "env.max_steps=40")}[env]
     for compiled in ("true", "false"):
         directory = tmp_path / compiled
-        run_ecpo(tmp_path, "seed=5", f"compile={compiled}", *size, f"hydra.run.dir={directory}")
+        options = ("seed=5", f"compile={compiled}", *size, f"hydra.run.dir={directory}")
+        run_ecpo(tmp_path, *options, afresh=True)
     metrics = read_metrics(tmp_path / "true")
     expected = read_metrics(tmp_path / "false")
     assert metrics.keys() == expected.keys()

@@ -26,6 +26,7 @@ from torchrl.checkpoint import (
     StateDictCheckpointAdapter,
 )
 
+from torchrl_ecpo.checks import check_count
 from torchrl_ecpo.experiment.run import Run, differences, flatten
 
 __all__ = ["Checkpoints", "Progress"]
@@ -303,31 +304,22 @@ OmegaConf.register_new_resolver("run_directory", run_directory, replace=True)
 
 
 def _check_options(options: DictConfig) -> None:
-    interval, keep, max_share = options.interval, options.keep, options.max_share
+    interval, max_share = options.interval, options.max_share
+    check_count("checkpoint.keep", options.keep)
     if interval is not None and not (isinstance(interval, (int, float)) and interval >= 0):
         raise ValueError(f"checkpoint.interval must be seconds or null, got {interval!r}.")
-    if not isinstance(keep, int) or keep < 1:
-        raise ValueError(f"checkpoint.keep must be an integer of at least 1, got {keep!r}.")
     if not isinstance(max_share, (int, float)) or not 0 < max_share <= 1:
         raise ValueError(f"checkpoint.max_share must lie in (0, 1], got {max_share!r}.")
 
 
 def _differences(saved: dict[str, Any], present: dict[str, Any]) -> list[str]:
-    """What differs between two configurations, but for `FREE_OPTIONS` and a total that has grown.
-
-    Nothing in a run depends on how long it is to be.
-    """
+    """What differs in two configurations, but for `FREE_OPTIONS` and a total that has grown."""
     old, new = (
         flatten({name: value for name, value in config.items() if name not in FREE_OPTIONS})
         for config in (saved, present)
     )
-    return [
-        words
-        for name, words in differences(old, new).items()
-        if not (
-            name.startswith("total_")
-            and name in old
-            and name in new
-            and float(old[name]) < float(new[name])
-        )
-    ]
+    for name in old.keys() & new.keys():
+        # Nothing in a run depends on how long it is to be.
+        if name.startswith("total_") and float(old[name]) < float(new[name]):
+            old[name] = new[name]
+    return list(differences(old, new).values())

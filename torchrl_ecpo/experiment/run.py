@@ -21,6 +21,7 @@ from torch import Tensor
 from torchrl.record.loggers import Logger, get_logger
 from tqdm import tqdm
 
+from torchrl_ecpo.checks import check_choice, check_count
 from torchrl_ecpo.experiment.figures import plot_learning_curve
 
 __all__ = ["METRICS_FILE", "MetricsTable", "Run", "check_options", "read_metrics"]
@@ -50,9 +51,7 @@ def check_options(config: DictConfig, counts: Sequence[str]) -> None:
         ValueError: size.k must be an integer of at least 1, got 0.
     """
     for name in (*counts, "threads"):
-        value = OmegaConf.select(config, name)
-        if not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name} must be an integer of at least 1, got {value!r}.")
+        check_count(name, OmegaConf.select(config, name))
     if not isinstance(config.seed, int):
         raise ValueError(f"seed must be an integer, got {config.seed!r}.")
     if not isinstance(config.compile, bool):
@@ -187,8 +186,7 @@ class Run:
         stack_size: int = 1,
     ) -> None:
         backend = config.logger.backend or "none"
-        if backend not in BACKENDS:
-            raise ValueError(f"logger.backend must be one of {BACKENDS}, got {backend!r}.")
+        check_choice("logger.backend", backend, BACKENDS)
         self.name, self.unit, self.shown = name, unit, shown
         self.directory = Path(directory).resolve()
         self.stack_size = stack_size

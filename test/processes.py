@@ -1,0 +1,40 @@
+"""Scripts, started as a user would start them."""
+
+from __future__ import annotations
+
+import multiprocessing
+import subprocess
+import sys
+from pathlib import Path
+
+FORKED = multiprocessing.get_context("forkserver")
+FORKED.set_forkserver_preload(["torchrl_ecpo.experiment", "torchrl_ecpo.collectors", "hydra"])
+AS_A_PROGRAM = """
+import os, runpy, sys
+os.chdir({directory!r})
+for stream, name in ((1, ".stdout"), (2, ".stderr")):
+    os.dup2(os.open(name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
+sys.argv = {command!r}
+sys.path.insert(0, os.path.dirname(sys.argv[0]))
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+def run_script(
+    directory: Path, script: Path, *options: str, afresh: bool = False
+) -> subprocess.CompletedProcess[str]:
+    """Run a script in a directory to its end.
+
+    Its process is forked from one that has imported torch, which takes a new interpreter most of a
+    short run. `afresh` takes a new interpreter: for what ends with ``atexit``, or compiles.
+    """
+    command = [str(script), *options]
+    if afresh:
+        command = [sys.executable, *command]
+        return subprocess.run(command, capture_output=True, text=True, cwd=directory, check=False)
+    code = AS_A_PROGRAM.format(directory=str(directory), command=command)
+    process = FORKED.Process(target=exec, args=(code, {}))
+    process.start()
+    process.join()
+    output, errors = ((directory / name).read_text() for name in (".stdout", ".stderr"))
+    return subprocess.CompletedProcess(command, process.exitcode or 0, output, errors)
