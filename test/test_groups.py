@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import pickle
 import random
 import re
 
@@ -423,6 +424,77 @@ class TestSampler:
             draws.append(torch.stack([buffer.sample()["x"] for _ in range(4)]))
         assert (draws[0] == draws[1]).all()
         assert not (draws[0] == draws[2]).all()
+
+
+class TestNet:
+    """Mutations that earlier tests let through."""
+
+    @pytest.mark.parametrize("what", ["groups", "members"])
+    def test_draws_are_uniform_and_independent(self, what):
+        """Ordered pairs of 4 groups, or of 4 members: each pair follows each equally often."""
+        trajectories = [(group, 1) for group in range(4) for _ in range(2)]
+        options = {"groups": {"num_groups": 2}, "members": {"num_groups": 1}}[what]
+        buffer = make_buffer(seed=1, **options)
+        buffer.extend(make_steps(trajectories if what == "groups" else [(7, 1)] * 4))
+        sampler, storage = buffer.sampler, buffer.storage
+        size = 4 if what == "groups" else 2
+        draws = torch.stack([sampler.sample(storage, size)[0].flatten() for _ in range(6000)])
+        first, second = (draws[:, ::2] // 2 if what == "groups" else draws).unbind(1)
+        assert (first != second).all()
+        pair = 4 * first + second
+        counts = (16 * pair[:-1] + pair[1:]).bincount(minlength=256)
+        possible = torch.arange(16)[torch.arange(16) // 4 != torch.arange(16) % 4]
+        counts = counts.view(16, 16)[possible][:, possible].double()
+        expected = 5999 / 144
+        chi_square = ((counts - expected) ** 2 / expected).sum()
+        assert chi_square < 143 + 5 * (2 * 143) ** 0.5
+
+    @pytest.mark.parametrize("parts", [(2, 4), (6,), (3, 3), (1, 2, 3), (5, 1)])
+    def test_what_just_fits_the_storage_is_drawn(self, parts):
+        buffer = make_buffer(6, batch_size=2)
+        for lap in range(3):
+            for part in make_steps([(7, 3), (7, 3)], first_id=2 * lap).split(parts):
+                buffer.extend(part)
+            drawn = buffer.sample()["x"].sort().values[0].tolist()
+            first = 2000 * lap
+            assert sorted(drawn) == [[first + i for i in (0, 1, 2)], [first + i for i in (3, 4, 5)]]
+
+    def test_a_torn_trajectory_is_not_whole_after_a_reindex(self):
+        """The oldest steps follow the end of the newest trajectory in the storage."""
+        buffer = make_buffer(8, batch_size=2)
+        buffer.extend(make_steps([(7, 4), (7, 2), (7, 2)]))
+        buffer.extend(make_steps([(7, 2)], first_id=50))  # over the first half of the first one
+        for sampler in (TrajectoryGroupSampler(group_size=2), pickle.loads(pickle.dumps(buffer))):
+            again = sampler if isinstance(sampler, TensorDictReplayBuffer) else buffer
+            if again is buffer:
+                buffer.set_sampler(sampler)
+            lengths = [again.sample()["collector", "mask"].sum(-1) for _ in range(30)]
+            assert torch.stack(lengths).unique().tolist() == [2]
+            assert all(is_whole(again.sample()) for _ in range(30))
+
+    @pytest.mark.parametrize(
+        ("ids", "done"),
+        [
+            ([3, 3, 0, 0, 0], [0, 1, 0, 0, 1]),  # the second one has the id 0
+            ([3, 3, 4, 4, 4], [0, 1, 0, 0, 0]),  # the second one has no end
+            ([0, 0, 4, 4, 0], [0, 1, 0, 1, 0]),
+        ],
+    )
+    def test_a_second_trajectory_in_a_padded_row_is_refused(self, ids, done):
+        row = TensorDict(
+            {
+                "group": torch.full((5,), 7),
+                "collector": {"traj_ids": torch.tensor(ids)},
+                "next": {"done": torch.tensor(done).bool().unsqueeze(-1)},
+            },
+            [5],
+        )
+        whole = row.clone()
+        whole["collector", "traj_ids"][2:] = 0
+        whole["next", "done"][2:] = False
+        assert pack_groups(torch.stack([whole, whole])).shape == (1, 2, 2)
+        with pytest.raises(ValueError, match=r"several trajectories.*flat"):
+            pack_groups(torch.stack([whole, row]))
 
 
 def test_plain_replay_buffer():

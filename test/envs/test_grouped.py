@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import gc
+import os
+import tracemalloc
 from functools import partial
 
 import pytest
@@ -21,7 +24,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_ecpo.envs.grouped import GroupedEnv
+from torchrl_ecpo.envs import GroupedEnv, GroupIdAllocator
 from torchrl_ecpo.groups import TrajectoryGroupSampler
 
 # A function of this module could not be imported by worker processes.
@@ -213,3 +216,47 @@ def test_reset_td_without_group_keeps_it():
     assert again["group"][0, 0] != start["group"][0, 0]
     assert isinstance(again, TensorDict)
     env.close()
+
+
+def test_episodes_that_are_over_are_forgotten():
+    """Copies that are reset one by one, and never all together, keep no record of the past."""
+    env = GroupedEnv(cartpole, num_groups=1, group_size=2)
+    start = env.reset()
+
+    def episodes(number):
+        for _ in range(number):
+            for mask in ([True], [False]), ([False], [True]):
+                env.reset(start.clone().set("_reset", torch.tensor([mask])))
+
+    def kept():
+        gc.collect()
+        own = tracemalloc.take_snapshot().filter_traces(
+            [tracemalloc.Filter(True, f"*torchrl_ecpo{os.sep}envs{os.sep}*")]
+        )
+        return sum(block.size for block in own.traces)
+
+    tracemalloc.start()
+    try:
+        episodes(10)
+        before = kept()
+        episodes(100)
+        assert kept() - before < 1000
+    finally:
+        tracemalloc.stop()
+    env.close()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that are forked")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_ids_of_forked_processes_differ():
+    allocator = GroupIdAllocator()
+    allocator.allocate(1)
+    reader, writer = os.pipe()
+    child = os.fork()
+    if not child:
+        os.write(writer, str(int(allocator.allocate(1))).encode())
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert int(os.read(reader, 100)) != int(allocator.allocate(1))
+    os.close(reader)
+    os.close(writer)
