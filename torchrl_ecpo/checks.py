@@ -23,6 +23,43 @@ def check_count(name: str, value: Any, *, least: int = 1, reason: str = "") -> N
         raise ValueError(f"{name} must be an integer of at least {least}{reason}, got {value!r}.")
 
 
+def check_group_size(size: Any, name: str = "group_size") -> None:
+    """Refuse a K below 2."""
+    reason = ": a trajectory is weighed against the others of its group"
+    check_count(name, size, least=2, reason=reason)
+
+
+def check_mask(key: NestedKey, mask: Tensor, shape: torch.Size) -> Tensor:
+    """A mask without its trailing 1, of the shape of the batch; refuse any other."""
+    if mask.shape == (*shape, 1):
+        mask = mask.squeeze(-1)
+    if mask.shape != shape:
+        raise ValueError(
+            f"The mask {key!r} must have the shape {tuple(shape)} of the batch (that of the reward "
+            f"without its trailing 1), got {tuple(mask.shape)}."
+        )
+    if mask.dtype != torch.bool:
+        raise ValueError(
+            f"The mask {key!r} must be boolean (True: the step is real), got {mask.dtype}."
+        )
+    return mask
+
+
+def check_padding(keys: Sequence[NestedKey], mask: Tensor) -> None:
+    """Refuse holes ``[..., T]``: a policy with memory would read other histories than it acted on.
+
+    Args:
+        keys: of the mask, for the message.
+        mask: True where a step is real.
+    """
+    holes = (mask[..., 1:] & ~mask[..., :-1]).any(-1)
+    if holes.any():
+        raise ValueError(
+            f"The mask {tuple(keys)} has holes in {int(holes.sum())} trajectories: their real "
+            "steps must come first, and the padding after them."
+        )
+
+
 def values_can_be_seen() -> bool:
     """Whether tensors have values to check: not while being compiled, nor within ``torch.vmap``."""
     return not (torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active())
