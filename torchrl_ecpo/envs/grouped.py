@@ -14,6 +14,7 @@ from torchrl.data import Unbounded
 from torchrl.data.utils import CloudpickleWrapper
 from torchrl.envs import EnvBase, GymWrapper, ParallelEnv, SerialEnv, TransformedEnv
 
+from torchrl_ecpo.checks import check_count, check_group_size
 from torchrl_ecpo.envs._groups import GroupIdAllocator
 from torchrl_ecpo.groups import GROUP_KEY
 
@@ -48,6 +49,7 @@ class GroupedEnv(EnvBase):
 
     Raises:
         ValueError: if `group_size` is below 2, `num_groups` below 1, or a copy has a batch size.
+        RuntimeError: at a reset of everything, if the copies of a row do not start alike.
 
     Examples:
         >>> from torchrl.envs import GymEnv
@@ -72,11 +74,8 @@ class GroupedEnv(EnvBase):
         parallel: bool = False,
     ) -> None:
         """Make the environment; the class describes the arguments."""
-        if num_groups < 1 or group_size < 2:
-            raise ValueError(
-                "A GroupedEnv needs at least 1 group of at least 2 copies, got "
-                f"num_groups={num_groups}, group_size={group_size}."
-            )
+        check_count("num_groups", num_groups)
+        check_group_size(group_size)
         batched = ParallelEnv if parallel else SerialEnv
         copies = batched(
             num_groups * group_size, CloudpickleWrapper(partial(_make_copy, create_env_fn))
@@ -131,7 +130,23 @@ class GroupedEnv(EnvBase):
         self._group = group
         flat = None if tensordict is None or mask is None else tensordict.reshape(-1)
         out = self.copies.reset(flat, list_of_kwargs=options)
-        return out.reshape(self.batch_size).set(GROUP_KEY, group.clone())
+        out = out.reshape(self.batch_size)
+        if mask is None:
+            self._check_alike(out)
+        return out.set(GROUP_KEY, group.clone())
+
+    def _check_alike(self, start: TensorDictBase) -> None:
+        for key in self.full_observation_spec.keys(True, True):
+            value = start.get(key, None)
+            if not isinstance(value, torch.Tensor):
+                continue
+            first = value[:, :1]
+            if not ((value == first) | ((value != value) & (first != first))).all():
+                raise RuntimeError(
+                    f"The copies of a group differ in {key!r} at their start, though they are "
+                    "reset with one seed. The environment has to draw its start from a generator "
+                    "that its reset seeds, gymnasium's self.np_random, or from torch's."
+                )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         out = self.copies.step(tensordict.reshape(-1))["next"]
