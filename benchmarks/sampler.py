@@ -1,4 +1,4 @@
-"""Time and memory of `TrajectoryGroupSampler` for storages of 1e4 to 1e6 steps.
+"""Time of `TrajectoryGroupSampler` for storages of 1e4 to 1e6 steps.
 
 Run: python benchmarks/sampler.py
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import time
-import tracemalloc
 from collections.abc import Callable
 from statistics import median
 
@@ -50,7 +49,7 @@ def milliseconds(run: Callable[[], object], repeats: int) -> float:
 
 
 def measure(size: int, repeats: int) -> tuple[float, ...]:
-    """Return the cost of filling, writing and drawing with a storage of `size` steps."""
+    """Return the cost of writing and drawing with a storage of `size` steps."""
     sampler = TrajectoryGroupSampler(group_size=GROUP_SIZE)
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(size), sampler=sampler, batch_size=NUM_GROUPS * GROUP_SIZE
@@ -60,18 +59,17 @@ def measure(size: int, repeats: int) -> tuple[float, ...]:
         buffer.extend(make_groups(written, min(size, 100_000)))
         written += 100_000
     batch = make_groups(10**9, NUM_GROUPS * GROUP_SIZE * MEAN_LENGTH)
+    storage, count = buffer.storage, NUM_GROUPS * GROUP_SIZE
+
+    def write_and_draw() -> None:
+        buffer.extend(batch)
+        sampler.sample(storage, count)
+
     write = milliseconds(lambda: buffer.extend(batch), repeats)
-    storage = buffer.storage
-    draw = milliseconds(lambda: sampler.sample(storage, NUM_GROUPS * GROUP_SIZE), repeats)
+    first = milliseconds(write_and_draw, repeats)
+    draw = milliseconds(lambda: sampler.sample(storage, count), repeats)
     sample = milliseconds(buffer.sample, repeats)
-    tracemalloc.start()
-    for _ in range(3):
-        sampler.sample(storage, NUM_GROUPS * GROUP_SIZE)
-    peak = tracemalloc.get_traced_memory()[1] / 1e6
-    tracemalloc.stop()
-    tables = (sampler._length, sampler._group, sampler._owner)
-    index = sum(table.numel() * table.element_size() for table in tables) / 1e6
-    return write, draw, sample, peak, index
+    return write, first, draw, sample
 
 
 def main() -> None:
@@ -83,13 +81,13 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     print(f"{NUM_GROUPS} groups of {GROUP_SIZE} trajectories a draw and a write, one thread")
-    columns = ("steps", "write ms", "draw ms", "sample ms", "draw MB", "tables MB")
-    print("".join(f"{column:>11}" for column in columns))
+    columns = ("steps", "write ms", "write+draw ms", "draw ms", "sample ms")
+    print("".join(f"{column:>14}" for column in columns))
     table = []
     for size in map(int, arguments.sizes):
         figures = measure(size, arguments.repeats)
-        print(f"{size:>11,}" + "".join(f"{figure:>11.2f}" for figure in figures))
-        names = (column.replace(" ", "_") for column in columns)
+        print(f"{size:>14,}" + "".join(f"{figure:>14.2f}" for figure in figures))
+        names = (column.replace(" ", "_").replace("+", "_and_") for column in columns)
         table.append(dict(zip(names, (size, *figures), strict=True)))
     write_csv(arguments.csv, table)
 

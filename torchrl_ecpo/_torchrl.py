@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torchrl.data.replay_buffers import ReplayBuffer, Storage
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
@@ -9,6 +10,7 @@ PRIVATE_NAMES: tuple[tuple[object, str], ...] = (
     (LossModule, "_all_schedulable_buffers"),
     (LossModule(), "_has_update_associated"),  # of each instance
     (EnvBase, "_step_proc_data"),  # overridden by AlgorithmicEnv: saves a tenth of a step
+    (Storage, "_attached_entities"),
 )
 """Names used here; ``test/test_private_names.py`` says which one a new version has lost."""
 
@@ -29,3 +31,12 @@ def networks_with_updater(loss_module: LossModule) -> dict[str, bool]:
     TorchRL's own constructor marks all of them, and there is no public name for one.
     """
     return loss_module._has_update_associated
+
+
+def buffers_of(storage: Storage) -> list[ReplayBuffer]:
+    """The buffers that write to a storage.
+
+    A sampler is given the storage alone. Where the oldest step is, and whether another process has
+    written, only the buffer's writer knows.
+    """
+    return storage._attached_entities

@@ -1,10 +1,14 @@
 from __future__ import annotations
 
+import gc
+import os
+import tracemalloc
 from functools import partial
 
+import gymnasium
+import numpy
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import (
@@ -12,6 +16,7 @@ from torchrl.envs import (
     DMControlEnv,
     DoubleToFloat,
     GymEnv,
+    GymWrapper,
     InitTracker,
     PendulumEnv,
     RewardSum,
@@ -21,7 +26,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_ecpo.envs.grouped import GroupedEnv
+from torchrl_ecpo.envs import GroupedEnv, GroupIdAllocator
 from torchrl_ecpo.groups import TrajectoryGroupSampler
 
 # A function of this module could not be imported by worker processes.
@@ -43,32 +48,24 @@ def headless(monkeypatch):
 
 
 @pytest.mark.parametrize("maker", MAKERS)
-def test_copies_start_from_the_same_state(maker):
+def test_groups_of_any_environment(maker):
     make, key = MAKERS[maker]
-    env = GroupedEnv(make, num_groups=2, group_size=3)
-    groups, starts = [], []
-    for _ in range(3):
-        start = env.reset()
-        assert start.shape == (2, 3)
-        assert (start[key] == start[key][:, :1]).all()
-        assert (start["group"] == start["group"][:, :1]).all()
-        groups.append(start["group"][:, 0])
-        starts.append(start[key][:, 0].double().reshape(2, -1))
-        env.rollout(2, auto_reset=False, tensordict=start)
-    assert torch.cat(groups).unique().numel() == 6
-    assert torch.cat(starts).unique(dim=0).shape[0] == 6
-    env.close()
-
-
-@pytest.mark.parametrize("maker", MAKERS)
-def test_specs_and_transforms(maker):
-    make, _ = MAKERS[maker]
     env = GroupedEnv(make, num_groups=2, group_size=2)
     check_env_specs(env, seed=0)
     if maker != "transformed":
         transforms = [InitTracker(), RewardSum(), StepCounter(max_steps=4), DoubleToFloat()]
         env = TransformedEnv(env, Compose(*transforms))
         check_env_specs(env, seed=0)
+    groups, starts = [], []
+    for _ in range(3):
+        start = env.reset()
+        assert start.shape == (2, 2)
+        assert (start[key] == start[key][:, :1]).all()
+        assert (start["group"] == start["group"][:, :1]).all()
+        groups.append(start["group"][:, 0])
+        starts.append(start[key][:, 0].double().reshape(2, -1))
+    assert torch.cat(groups).unique().numel() == 6
+    assert torch.cat(starts).unique(dim=0).shape[0] == 6
     rollout = env.rollout(12, break_when_any_done=False)
     assert rollout.shape == (2, 2, 12)
     assert rollout["next", "done"].any()
@@ -134,7 +131,7 @@ def test_reset_leaves_the_random_state_alone(make):
     env.close()
 
 
-def test_partial_steps_leave_the_others_where_they_are():
+def test_partial_steps_and_resets_leave_the_others_where_they_are():
     env = GroupedEnv(cartpole, num_groups=1, group_size=2)
     start = env.reset()
     td = env.rand_action(start.clone())
@@ -142,6 +139,8 @@ def test_partial_steps_leave_the_others_where_they_are():
     following = env.step(td.set("_step", step))["next"]
     moved = (following["observation"] != start["observation"]).any(-1)
     assert moved.tolist() == [[True, False]]
+    again = env.reset(start.clone().set("_reset", step))
+    assert (again["group"] == start["group"]).tolist() == [[False, True]]
     env.close()
 
 
@@ -194,8 +193,8 @@ def test_collector_and_sampler():
 @pytest.mark.parametrize(
     ("make", "sizes", "match"),
     [
-        (cartpole, (1, 1), "num_groups=1, group_size=1"),
-        (cartpole, (0, 2), "num_groups=0"),
+        (cartpole, (1, 1), r"group_size must be .* at least 2.*got 1"),
+        (cartpole, (0, 2), r"num_groups must be .* at least 1, got 0"),
         (lambda: SerialEnv(2, cartpole), (1, 2), r"batch size \(\), got \(2,\)"),
     ],
 )
@@ -204,12 +203,63 @@ def test_bad_input(make, sizes, match):
         GroupedEnv(make, num_groups=sizes[0], group_size=sizes[1])
 
 
-def test_reset_td_without_group_keeps_it():
+class Careless(gymnasium.Env):
+    """Draws its start from a generator that its reset does not seed."""
+
+    observation_space = gymnasium.spaces.Box(0, 1, (1,), dtype="float64")
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return numpy.random.rand(1), {}
+
+
+def test_copies_that_start_differently_are_refused():
+    env = GroupedEnv(lambda: GymWrapper(Careless()), num_groups=1, group_size=2)
+    with pytest.raises(RuntimeError, match=r"differ in 'observation' at their start.*np_random"):
+        env.reset()
+    env.close()
+
+
+def test_episodes_that_are_over_are_forgotten():
+    """Copies that are reset one by one, and never all together, keep no record of the past."""
     env = GroupedEnv(cartpole, num_groups=1, group_size=2)
     start = env.reset()
-    mask = torch.tensor([[[True], [False]]])
-    again = env.reset(start.clone().set("_reset", mask))
-    assert again["group"][0, 1] == start["group"][0, 1]
-    assert again["group"][0, 0] != start["group"][0, 0]
-    assert isinstance(again, TensorDict)
+
+    def episodes(number):
+        for _ in range(number):
+            for mask in ([True], [False]), ([False], [True]):
+                env.reset(start.clone().set("_reset", torch.tensor([mask])))
+
+    def kept():
+        gc.collect()
+        own = tracemalloc.take_snapshot().filter_traces(
+            [tracemalloc.Filter(True, f"*torchrl_ecpo{os.sep}envs{os.sep}*")]
+        )
+        return sum(block.size for block in own.traces)
+
+    tracemalloc.start()
+    try:
+        episodes(10)
+        before = kept()
+        episodes(100)
+        assert kept() - before < 1000
+    finally:
+        tracemalloc.stop()
     env.close()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that are forked")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_ids_of_forked_processes_differ():
+    allocator = GroupIdAllocator()
+    allocator.allocate(1)
+    reader, writer = os.pipe()
+    child = os.fork()
+    if not child:
+        os.write(writer, str(int(allocator.allocate(1))).encode())
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert int(os.read(reader, 100)) != int(allocator.allocate(1))
+    os.close(reader)
+    os.close(writer)

@@ -14,6 +14,7 @@ from torchrl.data import Unbounded
 from torchrl.data.utils import CloudpickleWrapper
 from torchrl.envs import EnvBase, GymWrapper, ParallelEnv, SerialEnv, TransformedEnv
 
+from torchrl_ecpo.checks import check_count, check_group_size
 from torchrl_ecpo.envs._groups import GroupIdAllocator
 from torchrl_ecpo.groups import GROUP_KEY
 
@@ -48,6 +49,7 @@ class GroupedEnv(EnvBase):
 
     Raises:
         ValueError: if `group_size` is below 2, `num_groups` below 1, or a copy has a batch size.
+        RuntimeError: at a reset of everything, if the copies of a row do not start alike.
 
     Examples:
         >>> from torchrl.envs import GymEnv
@@ -72,11 +74,8 @@ class GroupedEnv(EnvBase):
         parallel: bool = False,
     ) -> None:
         """Make the environment; the class describes the arguments."""
-        if num_groups < 1 or group_size < 2:
-            raise ValueError(
-                "A GroupedEnv needs at least 1 group of at least 2 copies, got "
-                f"num_groups={num_groups}, group_size={group_size}."
-            )
+        check_count("num_groups", num_groups)
+        check_group_size(group_size)
         batched = ParallelEnv if parallel else SerialEnv
         copies = batched(
             num_groups * group_size, CloudpickleWrapper(partial(_make_copy, create_env_fn))
@@ -92,7 +91,6 @@ class GroupedEnv(EnvBase):
         # Not a submodule: the state of the copies is not the state_dict's business.
         object.__setattr__(self, "copies", copies)
         self._copy_specs()
-        self._ids = GroupIdAllocator()
         self._group = torch.zeros(self.batch_size, dtype=torch.int64, device=self.device)
         self._set_seed(None)
 
@@ -106,27 +104,21 @@ class GroupedEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         self._seed = secrets.randbits(63) if seed is None else seed
+        self._ids = GroupIdAllocator()  # an instance of another seed is another one
         self._episode = np.zeros(self.batch_size, dtype=int)  # of each copy, the next one
-        # (row, episode) -> seed and group id, until the last copy of the row has started it.
-        self._instances: dict[tuple[int, int], tuple[int, int]] = {}
 
     def _next_instance(self, row: int, copy: int) -> tuple[int, int]:
-        episode = int(self._episode[row, copy])
+        """Return the seed and the group id of the next episode of a copy."""
+        key = row, int(self._episode[row, copy])
         self._episode[row, copy] += 1
-        key = row, episode
-        if key not in self._instances:
-            seed = np.random.SeedSequence(self._seed, spawn_key=key).generate_state(1)[0]
-            self._instances[key] = int(seed), int(self._ids.allocate(1))
-        if self._episode[row].min() > episode:
-            return self._instances.pop(key)
-        return self._instances[key]
+        seed = np.random.SeedSequence(self._seed, spawn_key=key).generate_state(1)[0]
+        return int(seed), self._ids.identify(*key)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             # The copies of a row may have played different numbers of episodes.
             self._episode[:] = self._episode.max(1, keepdims=True)
-            self._instances.clear()
             selected = torch.ones(self.batch_size, dtype=torch.bool)
         else:
             selected = mask.reshape(*self.batch_size, -1).any(-1).cpu()
@@ -137,11 +129,27 @@ class GroupedEnv(EnvBase):
             options[row * self.batch_size[1] + copy]["seed"] = seed
         self._group = group
         flat = None if tensordict is None or mask is None else tensordict.reshape(-1)
-        out = self.copies._reset(flat, list_of_kwargs=options)  # pyright: ignore[reportArgumentType]
-        return out.reshape(self.batch_size).set(GROUP_KEY, group.clone())
+        out = self.copies.reset(flat, list_of_kwargs=options)
+        out = out.reshape(self.batch_size)
+        if mask is None:
+            self._check_alike(out)
+        return out.set(GROUP_KEY, group.clone())
+
+    def _check_alike(self, start: TensorDictBase) -> None:
+        for key in self.full_observation_spec.keys(True, True):
+            value = start.get(key, None)
+            if not isinstance(value, torch.Tensor):
+                continue
+            first = value[:, :1]
+            if not ((value == first) | ((value != value) & (first != first))).all():
+                raise RuntimeError(
+                    f"The copies of a group differ in {key!r} at their start, though they are "
+                    "reset with one seed. The environment has to draw its start from a generator "
+                    "that its reset seeds, gymnasium's self.np_random, or from torch's."
+                )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        out = self.copies._step(tensordict.reshape(-1))
+        out = self.copies.step(tensordict.reshape(-1))["next"]
         return out.reshape(self.batch_size).set(GROUP_KEY, self._group.clone())
 
     def get_extra_state(self) -> dict[str, Any]:
