@@ -26,12 +26,13 @@ SCRIPTS = HERE.parent
 MANIFESTS = [HERE / "study.yaml", HERE / "search.yaml"]
 KINDS = ("curves", "heat_map", "ranking")
 RANKS = ("area", "final")
-# Runs that differ in these alone have the same numbers, as far as both go: the entries of env are
-# those that other entries are read from, the last is how Q networks are called.
+# Runs that differ in these alone have the same numbers, as far as both go.
 NOT_THE_RUN = (
-    *("resume", "checkpoint", "logger", "threads", "compile"),
-    *("env.settings", "env.optim", "env.cracked", "env.evaluation_interval"),
-    "loss.options.deactivate_vmap",
+    *("resume", "checkpoint", "logger", "threads", "compile", "stack"),
+    # Older records have them: other entries were read from those of env, ...
+    *("env.settings", "env.optim", "env.cracked", "env.num_groups", "env.evaluation_interval"),
+    "loss.length_normalised",  # ... this one was always false ...
+    "loss.options.deactivate_vmap",  # ... and this one said how Q networks were called.
 )
 
 Entry = TypeVar("Entry")
@@ -158,12 +159,13 @@ def identity(config: DictConfig) -> dict[str, float | str]:
 def changed_entries(
     old: Mapping[str, object], new: Mapping[str, object], ignored: Sequence[str] = ()
 ) -> list[str]:
-    """What differs between two runs, in words; but for entries that are ignored.
+    """What differs between two runs, in words; but for `NOT_THE_RUN` and entries that are ignored.
 
     Examples:
         >>> changed_entries({"tau": 0.5, "a.b": 1}, {"tau": 0.1}, ignored=["a"])
         ['tau was 0.5, is 0.1']
     """
+    ignored = (*NOT_THE_RUN, *ignored)
     return [words for name, words in differences(old, new).items() if not _is_below(name, ignored)]
 
 
