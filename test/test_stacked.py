@@ -12,23 +12,18 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.envs import InitTracker, TransformedEnv
 
-from torchrl_ecpo.envs import AlgorithmicEnv, BanditEnv, stack_envs
+from torchrl_ecpo.envs import AlgorithmicEnv
 from torchrl_ecpo.experiment import Checkpoints, Run, read_metrics
-from torchrl_ecpo.modules import (
-    TupleCategorical,
-    make_softmax_policy,
-    make_tuple_policy,
-    stack_policies,
-)
-from torchrl_ecpo.modules.histories import distinct_histories
-from torchrl_ecpo.modules.stacked import _RandomStreams
+from torchrl_ecpo.modules import TupleCategorical, make_softmax_policy, make_tuple_policy
+from torchrl_ecpo.modules.histories import distinct_histories, hash_histories
 
 SCRIPT = Path(__file__).parents[1] / "sota-implementations/ecpo"
-MODULES = ("utils", "tasks", "stack", "ecpo")
+MODULES = ("utils", "tasks", "stacked", "ecpo")
 BANDIT = ("env=bandit", "env.num_actions=50", "group_size=10", "total_trajectories=1000")
 COPY = (
     *("env=copy", "env.hidden_size=16", "num_groups=4", "group_size=5", "evaluation_interval=40"),
@@ -39,19 +34,22 @@ SEEDS = (3, 11)
 
 
 @pytest.fixture
-def train(monkeypatch):
+def script(monkeypatch):
+    """The folder of the script, as if it were started from there."""
+    monkeypatch.syspath_prepend(str(SCRIPT))
+    yield importlib.import_module
+    for name in [name for name in sys.modules if name.split(".")[0] in MODULES]:
+        del sys.modules[name]
+
+
+@pytest.fixture
+def train(script, monkeypatch):
     """Runs the script in this process, in a directory; until SIGTERM if `stop_at` says when."""
     monkeypatch.setattr("torchrl_ecpo.experiment.run.plot_learning_curve", lambda *_, **__: "")
-    for name in MODULES:
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    monkeypatch.syspath_prepend(str(SCRIPT))
-    main = importlib.import_module("ecpo").main
+    main = script("ecpo").main
     boundary = Checkpoints.boundary
 
     def train(directory, *options, stop_at=None):
-        with initialize_config_dir(str(SCRIPT / "config"), version_base="1.3"):
-            config = compose("config", ["checkpoint.interval=null", *options])
-
         def stop(checkpoints):
             if checkpoints.step == stop_at:
                 os.kill(os.getpid(), signal.SIGTERM)
@@ -60,11 +58,13 @@ def train(monkeypatch):
         directory.mkdir(exist_ok=True)
         monkeypatch.chdir(directory)
         monkeypatch.setattr(Checkpoints, "boundary", stop)
-        main.__wrapped__(config)
+        options = ["checkpoint.interval=null", *options]
+        with initialize_config_dir(str(SCRIPT / "config"), version_base="1.3"):
+            HydraConfig.instance().set_config(compose("config", options, return_hydra_config=True))
+            main.__wrapped__(compose("config", options))
 
     yield train
-    for name in MODULES:
-        sys.modules.pop(name, None)
+    HydraConfig.instance().cfg = None
 
 
 def assert_same_curves(actual, expected):

@@ -23,7 +23,6 @@ MASK_KEY: NestedKey = ("collector", "mask")
 TRAJECTORY_KEY: NestedKey = ("collector", "traj_ids")
 DONE_KEY: NestedKey = ("next", "done")
 GROUP_KEY: NestedKey = "group"
-RUN_KEY: NestedKey = "run"  # whose a row is, where several runs are stacked
 
 
 def pack_groups(
