@@ -26,14 +26,17 @@ SCRIPTS = HERE.parent
 MANIFESTS = [HERE / "study.yaml", HERE / "search.yaml"]
 KINDS = ("curves", "heat_map", "ranking")
 RANKS = ("area", "final")
-# Runs that differ in these alone have the same numbers, as far as both go.
+# Runs that differ in these alone have the same numbers, as far as both go: the entries of env are
+# those that other entries are or were read from, the last is how Q networks are called.
 NOT_THE_RUN = (
     *("resume", "checkpoint", "logger", "threads", "compile", "stack"),
-    # Older records have them: other entries were read from those of env, ...
     *("env.settings", "env.optim", "env.cracked", "env.num_groups", "env.evaluation_interval"),
-    "loss.length_normalised",  # ... this one was always false ...
-    "loss.options.deactivate_vmap",  # ... and this one said how Q networks were called.
+    "loss.options.deactivate_vmap",
 )
+# Entries that the scripts no longer have, with the one value that is left: older runs have them.
+GONE = {
+    "loss.length_normalised": False,  # of the entropy term of a lift; true had no result
+}
 
 Entry = TypeVar("Entry")
 
@@ -165,8 +168,9 @@ def changed_entries(
         >>> changed_entries({"tau": 0.5, "a.b": 1}, {"tau": 0.1}, ignored=["a"])
         ['tau was 0.5, is 0.1']
     """
+    changes = differences({**GONE, **old}, {**GONE, **new})
     ignored = (*NOT_THE_RUN, *ignored)
-    return [words for name, words in differences(old, new).items() if not _is_below(name, ignored)]
+    return [words for name, words in changes.items() if not _is_below(name, ignored)]
 
 
 def _is_below(name: str, entries: Iterable[str]) -> bool:

@@ -47,7 +47,8 @@ def runs_of(config: DictConfig, overrides: Sequence[str]) -> dict[str, DictConfi
 
 def _asked_for(config: DictConfig) -> list[list[str]]:
     """The options of each run that are not those of all."""
-    seeds, stack = config.seeds, config.stack
+    seeds: Any = config.seeds
+    stack: Any = config.stack
     if seeds is not None and stack is not None:
         raise ValueError("Give seeds or stack, not both: stack=['loss=urex seed=0,1'] has seeds.")
     if seeds is not None:
@@ -105,7 +106,7 @@ def _check_together(runs: Sequence[DictConfig]) -> None:
     if not first.env.get("distinct_histories", True):
         raise ValueError("Stacked runs need env.distinct_histories=true.")
     flat = [flatten(OmegaConf.to_container(run, resolve=True)) for run in runs]
-    for name in dict.fromkeys(name for own in flat for name in own):
+    for name in dict.fromkeys(["env.name", *(name for own in flat for name in own)]):
         values = list(dict.fromkeys(str(own.get(name, "absent")) for own in flat))
         if len(values) > 1 and not any(f"{name}.".startswith(f"{one}.") for one in MAY_DIFFER):
             raise ValueError(

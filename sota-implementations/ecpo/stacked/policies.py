@@ -137,8 +137,9 @@ class _StackedTuplePolicy(StackedPolicy):
         super().__init__()
         self.core = _StackedHistoryLSTM([actor.module[0] for actor in actors])
         self.options = actors[0].module[1].distribution_kwargs
-        self.in_keys = self.core.in_keys
-        self.out_keys = [*self.core.out_keys, "action", "action_log_prob"]
+        in_keys: list[Any] = self.core.in_keys
+        out_keys: list[Any] = [*self.core.out_keys, "action", "action_log_prob"]
+        self.in_keys, self.out_keys = in_keys, out_keys
         self.streams = streams
 
     @property
@@ -164,6 +165,9 @@ class _StackedTuplePolicy(StackedPolicy):
 
 class _StackedHistoryLSTM(DistinctHistoryLSTM):
     """The LSTM and the readout of each run. A symbol says which run it belongs to."""
+
+    cells: Any
+    """Cell and readout of each run."""
 
     def __init__(self, cores: Sequence[DistinctHistoryLSTM]) -> None:
         first = cores[0]

@@ -172,7 +172,8 @@ class Stack:
 
 
 def _make_member(directory: Path, config: DictConfig, task: Task, **options: Any) -> Member:
-    loss_module = make_loss(config.loss, _Evaluated())
+    evaluated: Any = _Evaluated()
+    loss_module = make_loss(config.loss, evaluated)
     directory.mkdir(exist_ok=True)
     return Member(
         config,
