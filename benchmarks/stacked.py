@@ -24,11 +24,12 @@ import torch
 from csv_table import add_csv_option, write_csv
 from hydra import compose, initialize_config_dir
 from loop import PROJECT_STEPS, Iteration, bias_to_last, take_turns
+from torch.nn.utils import clip_grad_norm_
 
 SCRIPT = Path(__file__).resolve().parents[1] / "sota-implementations/ecpo"
 sys.path.insert(0, str(SCRIPT))
 
-from stacked import Stack  # noqa: E402 # pyright: ignore[reportMissingImports]
+from stacked.training import Stack  # noqa: E402 # pyright: ignore[reportMissingImports]
 from tasks import make_task  # noqa: E402 # pyright: ignore[reportMissingImports]
 from utils import (  # noqa: E402 # pyright: ignore[reportMissingImports]
     make_collector,
@@ -68,10 +69,8 @@ def single_run(env: str, level: int | None) -> Iteration:
         losses = loss_module(groups)
         optimizer.zero_grad()
         losses["loss_actor"].backward()
-        metrics = {
-            **losses.detach(),
-            "grad_norm": torch.nn.utils.clip_grad_norm_(loss_module.parameters(), 50.0),
-        }
+        grad_norm = clip_grad_norm_(loss_module.parameters(), 50.0)
+        metrics = {**losses.detach(), "grad_norm": grad_norm}
         run.check(metrics, iteration)
         optimizer.step()
         run.log({**metrics, **task.measure(groups), **temperatures.values()}, iteration)

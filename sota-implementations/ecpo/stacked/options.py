@@ -47,11 +47,10 @@ def runs_of(config: DictConfig, overrides: Sequence[str]) -> dict[str, DictConfi
 
 def _asked_for(config: DictConfig) -> list[list[str]]:
     """The options of each run that are not those of all."""
-    seeds: Any = config.seeds
-    stack: Any = config.stack
-    if seeds is not None and stack is not None:
+    seeds, stack = config.seeds, config.stack
+    if None not in (seeds, stack):
         raise ValueError("Give seeds or stack, not both: stack=['loss=urex seed=0,1'] has seeds.")
-    if seeds is not None:
+    if stack is None:
         if not _is_list(seeds, int) or len({*seeds}) < len(seeds):
             raise ValueError(
                 "seeds must be a list of different integers, such as seeds=[0,1,2], or null for a "
