@@ -135,7 +135,7 @@ class DistinctNet:
     def step(self, symbol: Tensor, state: State | None) -> tuple[Tensor, State]:
         """Logits and state `[n, *]` of one step; without a state, the first."""
         starts = torch.full((1, len(symbol)), state is None)
-        nodes, *values = self.core._run(symbol.unsqueeze(0), starts, None, state)
+        nodes, *values = self.core.evaluate(symbol.unsqueeze(0), starts, states=state)
         logits, h, c = (value.index_select(0, nodes[0]) for value in values)
         return logits, (h, c)
 
@@ -143,7 +143,7 @@ class DistinctNet:
         """Logits `[T, N, L]` of whole trajectories."""
         starts = ~steps.mask
         starts[0] = True
-        nodes, logits, *_ = self.core._run(steps.symbol, starts, steps.mask, None)
+        nodes, logits, *_ = self.core.evaluate(steps.symbol, starts, steps.mask)
         return logits.index_select(0, nodes.flatten()).view(*nodes.shape, -1)
 
 

@@ -24,55 +24,84 @@ import torch
 from csv_table import add_csv_option, write_csv
 from hydra import compose, initialize_config_dir
 from loop import PROJECT_STEPS, Iteration, bias_to_last, take_turns
+from torch.nn.utils import clip_grad_norm_
 
 SCRIPT = Path(__file__).resolve().parents[1] / "sota-implementations/ecpo"
 sys.path.insert(0, str(SCRIPT))
 
-from stack import make_stack  # noqa: E402 # pyright: ignore[reportMissingImports]
+from stacked.training import Stack  # noqa: E402 # pyright: ignore[reportMissingImports]
+from tasks import make_task  # noqa: E402 # pyright: ignore[reportMissingImports]
 from utils import (  # noqa: E402 # pyright: ignore[reportMissingImports]
+    make_collector,
+    make_loss,
     make_optimizer,
-    make_parts,
+    make_run,
+    make_temperatures,
 )
 
 
-def make_iteration(env: str, level: int | None, seeds: list[int] | None) -> Iteration:
-    """One iteration of a single run, or of stacked ones."""
-    options = [f"env={env}", f"seeds={'null' if seeds is None else seeds}", "logger.backend=none"]
+def compose_run(env: str, level: int | None, seed: int) -> Any:
+    """The configuration of a run."""
+    options = [f"env={env}", f"seed={seed}", "logger.backend=none"]
+    if level:
+        options.append("optim.lr=1e-9")
     with initialize_config_dir(str(SCRIPT / "config"), version_base="1.3"):
-        config = compose("config", overrides=[*options, *(["optim.lr=1e-9"] if level else [])])
-    parts = make_parts(config) if seeds is None else make_stack(config)
-    if level is not None:
-        lengthen(parts, level)
-    optimizer = make_optimizer(config.optim, parts.loss_module)
-    batches = iter(parts.collector)
-    iteration = 0
+        return compose("config", options)
+
+
+def single_run(env: str, level: int | None) -> Iteration:
+    """One iteration of a run by itself."""
+    config = compose_run(env, level, seed=0)
+    task = make_task(config)
+    lengthen(task, level)
+    collector = make_collector(config, task)
+    loss_module: Any = make_loss(config.loss, task.actor)
+    optimizer = make_optimizer(config.optim, loss_module.parameters())
+    temperatures = make_temperatures(config.loss, loss_module)
+    run, batches, iteration = make_run(config, task), iter(collector), 0
 
     def iterate() -> int:
         nonlocal iteration
         if iteration % PROJECT_STEPS == 0:
-            parts.collector.update_policy_weights_()
+            collector.update_policy_weights_()
         iteration += 1
         groups = next(batches)
-        losses = parts.loss_module(groups)
+        losses = loss_module(groups)
         optimizer.zero_grad()
-        losses["loss_actor"].sum().backward()
-        metrics = {**losses.detach(), "grad_norm": parts.clip_grad_norm_(50.0)}
-        parts.run.check(metrics, iteration)
+        losses["loss_actor"].backward()
+        grad_norm = clip_grad_norm_(loss_module.parameters(), 50.0)
+        metrics = {**losses.detach(), "grad_norm": grad_norm}
+        run.check(metrics, iteration)
         optimizer.step()
-        metrics |= {**parts.task.measure(groups), **parts.temperatures.values()}
-        parts.run.log(metrics, iteration)
+        run.log({**metrics, **task.measure(groups), **temperatures.values()}, iteration)
         return 1
 
     return iterate
 
 
-def lengthen(parts: Any, level: int) -> None:
-    """Put the curriculum of each run at a level, and bias its policy."""
-    env = parts.task.env
-    for own in getattr(env, "runs", [env]):
-        own.curriculum.levels.fill_(level)
-        own.curriculum.kind = None
-    bias_to_last(parts.task.actor)
+def stacked_runs(env: str, level: int | None, number: int) -> Iteration:
+    """One iteration of a stack."""
+    configs = {f"seed_{seed}": compose_run(env, level, seed) for seed in range(number)}
+    stack = Stack(configs)
+    for member in stack.members:
+        lengthen(member.task, level)
+        member.config.project_steps = PROJECT_STEPS
+        member.config.evaluation_interval = 1_000_000
+
+    def iterate() -> int:
+        stack.lift()
+        stack.project()
+        return 1
+
+    return iterate
+
+
+def lengthen(task: Any, level: int | None) -> None:
+    """Put the curriculum of a run at a level, and bias its policy."""
+    if level is not None:
+        task.env.curriculum.levels.fill_(level)
+        task.env.curriculum.kind = None
+        bias_to_last(task.actor)
 
 
 def main() -> None:
@@ -91,8 +120,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as directory:
         os.chdir(directory)
         for env, level in cases:
-            loops = [make_iteration(env, level, None)]
-            loops += [make_iteration(env, level, list(range(n))) for n in arguments.runs]
+            loops = [single_run(env, level)]
+            loops += [stacked_runs(env, level, number) for number in arguments.runs]
             (single, *stacked), _, _ = take_turns(loops, arguments.repeats)
             for runs, ms in zip(arguments.runs, stacked, strict=True):
                 gain = runs * single / ms

@@ -36,15 +36,8 @@ EXTENSION_POINTS = {
 STILL_TO_CLEAN = {
     "sota-implementations/ecac/score_sac.py",
     "sota-implementations/ecac/utils.py",
-    "torchrl_ecpo/collectors/groups.py",
-    "torchrl_ecpo/collectors/supervised.py",
-    "torchrl_ecpo/envs/replay.py",
-    "torchrl_ecpo/experiment/compiling.py",
-    "torchrl_ecpo/groups.py",
     "torchrl_ecpo/modules/actor_critic.py",
-    "torchrl_ecpo/modules/tuple_policy.py",
     "torchrl_ecpo/objectives/actor_critic.py",
-    "torchrl_ecpo/updaters.py",
 }
 
 

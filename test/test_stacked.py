@@ -12,23 +12,19 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.envs import InitTracker, TransformedEnv
 
-from torchrl_ecpo.envs import AlgorithmicEnv, BanditEnv, stack_envs
+from torchrl_ecpo.envs import AlgorithmicEnv
 from torchrl_ecpo.experiment import Checkpoints, Run, read_metrics
-from torchrl_ecpo.modules import (
-    TupleCategorical,
-    make_softmax_policy,
-    make_tuple_policy,
-    stack_policies,
-)
-from torchrl_ecpo.modules.histories import distinct_histories
-from torchrl_ecpo.modules.stacked import _RandomStreams
+from torchrl_ecpo.modules import TupleCategorical, make_softmax_policy, make_tuple_policy
+from torchrl_ecpo.modules.histories import distinct_histories, hash_histories
 
 SCRIPT = Path(__file__).parents[1] / "sota-implementations/ecpo"
-MODULES = ("utils", "tasks", "stack", "ecpo")
+MODULES = ("utils", "tasks", "stacked", "ecpo")
 BANDIT = ("env=bandit", "env.num_actions=50", "group_size=10", "total_trajectories=1000")
 COPY = (
     *("env=copy", "env.hidden_size=16", "num_groups=4", "group_size=5", "evaluation_interval=40"),
@@ -39,19 +35,22 @@ SEEDS = (3, 11)
 
 
 @pytest.fixture
-def train(monkeypatch):
+def script(monkeypatch):
+    """The folder of the script, as if it were started from there."""
+    monkeypatch.syspath_prepend(str(SCRIPT))
+    yield importlib.import_module
+    for name in [name for name in sys.modules if name.split(".")[0] in MODULES]:
+        del sys.modules[name]
+
+
+@pytest.fixture
+def train(script, monkeypatch):
     """Runs the script in this process, in a directory; until SIGTERM if `stop_at` says when."""
     monkeypatch.setattr("torchrl_ecpo.experiment.run.plot_learning_curve", lambda *_, **__: "")
-    for name in MODULES:
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    monkeypatch.syspath_prepend(str(SCRIPT))
-    main = importlib.import_module("ecpo").main
+    main = script("ecpo").main
     boundary = Checkpoints.boundary
 
     def train(directory, *options, stop_at=None):
-        with initialize_config_dir(str(SCRIPT / "config"), version_base="1.3"):
-            config = compose("config", ["checkpoint.interval=null", *options])
-
         def stop(checkpoints):
             if checkpoints.step == stop_at:
                 os.kill(os.getpid(), signal.SIGTERM)
@@ -60,11 +59,14 @@ def train(monkeypatch):
         directory.mkdir(exist_ok=True)
         monkeypatch.chdir(directory)
         monkeypatch.setattr(Checkpoints, "boundary", stop)
-        main.__wrapped__(config)
+        options = ["checkpoint.interval=null", *options]
+        with initialize_config_dir(str(SCRIPT / "config"), version_base="1.3"):
+            whole = compose("config", options, return_hydra_config=True)
+            HydraConfig.instance().set_config(whole)
+            main.__wrapped__(OmegaConf.masked_copy(whole, [key for key in whole if key != "hydra"]))
 
     yield train
-    for name in MODULES:
-        sys.modules.pop(name, None)
+    HydraConfig.instance().cfg = None
 
 
 def assert_same_curves(actual, expected):
@@ -78,21 +80,13 @@ def assert_same_curves(actual, expected):
         assert actual[name] == pytest.approx(column, **tolerance), name
 
 
-def slow(*options):
-    return pytest.param(options, marks=pytest.mark.slow)
-
-
 @pytest.mark.parametrize(
     "options",
     [
-        BANDIT,
         COPY,
-        slow(*BANDIT, "loss=pmd_entropy", "project_steps=4"),
-        slow(*BANDIT, "loss=urex"),
-        slow(*BANDIT, "loss=ment"),
-        slow(*COPY, "env=reversed_addition", "loss=pmd_entropy"),
+        pytest.param((*COPY, "env=reversed_addition", "loss=pmd_entropy"), marks=pytest.mark.slow),
     ],
-    ids=["bandit", "copy", "pmd", "urex", "ment", "reversed_addition"],
+    ids=["copy", "reversed_addition"],
 )
 def test_stacked_runs_have_the_curves_of_single_ones(tmp_path, train, options):
     train(tmp_path / "stack", *options, f"seeds={[*SEEDS]}")
@@ -111,37 +105,93 @@ def test_stacked_runs_have_the_curves_of_single_ones(tmp_path, train, options):
         assert taus[0][-1] != taus[1][-1], "each run begins to anneal when it has cracked the task"
 
 
-@pytest.mark.parametrize("options", [BANDIT, COPY], ids=["bandit", "copy"])
+SETTINGS = {
+    "bandit": (BANDIT, ("loss=ecpo seed=3", "loss=urex loss.tau=0.2,0.5 seed=4")),
+    "copy": (
+        COPY,
+        (
+            "loss=ecpo loss.tau=0.25,1.0 seed=3",
+            "loss=urex seed=4 env.curriculum=group optim.lr=0.003 optim.amsgrad=false",
+            "loss=ment seed=3 project_steps=1 anneal_from=null evaluation_interval=30",
+        ),
+    ),
+}
+RUNS = {
+    "bandit": (
+        "loss=ecpo seed=3",
+        "loss=urex loss.tau=0.2 seed=4",
+        "loss=urex loss.tau=0.5 seed=4",
+    ),
+    "copy": (
+        "loss=ecpo loss.tau=0.25 seed=3",
+        "loss=ecpo loss.tau=1.0 seed=3",
+        *SETTINGS["copy"][1][1:],
+    ),
+}
+
+
+@pytest.mark.parametrize("task", SETTINGS)
+def test_methods_and_settings_are_stacked(tmp_path, train, task):
+    options, entries = SETTINGS[task]
+    options = (*options, "total_trajectories=600")
+    train(tmp_path / "stack", *options, f"stack={[*entries]}")
+    for index, own in enumerate(RUNS[task]):
+        single, stacked = tmp_path / str(index), tmp_path / f"stack/run_{index}"
+        train(single, *options, *own.split())
+        assert_same_curves(stacked, single)
+        assert OmegaConf.load(stacked / "config.yaml") == OmegaConf.load(single / "config.yaml")
+    assert len(list((tmp_path / "stack").glob("run_*"))) == len(RUNS[task])
+
+
+STACK = "stack=['loss=ecpo seed=1','loss=urex seed=2 project_steps=1']"
+
+
+@pytest.mark.parametrize("options", [(*BANDIT, "seeds=[1,2]"), (*COPY, STACK)])
 def test_a_resumed_stack_goes_on_as_if_never_stopped(tmp_path, train, options):
-    options = (*options, "seeds=[1,2]", "total_trajectories=240")
+    options = (*options, "total_trajectories=240")
     train(tmp_path / "whole", *options)
     broken = tmp_path / "broken"
     with pytest.raises(SystemExit):
-        train(broken, *options, stop_at=120)
-    assert read_metrics(broken / "seed_1")["step"][-1] == 120
+        train(broken, *options, stop_at=100)  # in the middle of a projection of ECPO on Copy
+    runs = [path.parent.name for path in (tmp_path / "whole").glob("*/metrics.csv")]
+    assert len(runs) == 2
+    assert read_metrics(broken / runs[0])["step"][-1] == 100
     train(broken, *options, f"resume={broken}")
-    for seed in (1, 2):
-        resumed, whole = (
-            read_metrics(top / f"seed_{seed}") for top in (broken, tmp_path / "whole")
-        )
+    for run in runs:
+        resumed, whole = read_metrics(broken / run), read_metrics(tmp_path / "whole" / run)
         assert str(resumed) == str(whole)  # as text, in which NaN equals NaN
 
 
-@pytest.mark.parametrize("seeds", ["3", "[]", "[0,0]", "[0.5]", "[true,2]", "two"])
-def test_bad_seeds_are_refused(tmp_path, train, seeds):
-    with pytest.raises(ValueError, match="seeds must be a list of different integers"):
-        train(tmp_path, *BANDIT, f"seeds={seeds}")
+@pytest.mark.parametrize("name", ["seeds", "stack"])
+@pytest.mark.parametrize("given", [3, [], [0.5], [True, 2], "two", {}])
+def test_what_is_no_list_of_runs_is_refused(script, name, given):
+    config = OmegaConf.create({"seeds": None, "stack": None, name: given})
+    with pytest.raises(ValueError, match=f"{name} must be a list of"):
+        script("stacked.options").runs_of(config, [])
 
 
-def test_tasks_that_cannot_be_stacked_are_refused(tmp_path, train):
-    with pytest.raises(ValueError, match=r"got env\.kind='gym'.*--multirun seed=0,1"):
-        train(tmp_path, "env=gym", "seeds=[0,1]")
-    with pytest.raises(ValueError, match=r"collector=single, got .*'process'"):
-        train(tmp_path, *BANDIT, "collector=multi_sync", "seeds=[0,1]")
-    with pytest.raises(TypeError, match="distinct histories"):
-        train(tmp_path, *COPY, "env.distinct_histories=false", "seeds=[0,1]")
-    with pytest.raises(TypeError, match="got TransformedEnv"):
-        stack_envs([TransformedEnv(BanditEnv(group_size=2))])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["seeds=[0,0]"], "seeds must be a list of different integers"),
+        (["stack=['seed=0,1','seed=1']"], "'seed=1' is there twice"),
+        (["seeds=[0,1]", "stack=['seed=2']"], "seeds or stack, not both"),
+        (["stack=['loss.tua=1']"], "Could not override 'loss.tua'"),
+        (["stack=['project_steps=0']"], "project_steps must be an integer of at least 1"),
+        (["stack=['env=copy','env=reverse']"], "must agree in env.name, got copy and reverse"),
+        (["stack=['seed=0','group_size=5']"], "must agree in group_size, got 100 and 5. They may"),
+        (["stack=['seed=0','project_steps=3']"], "have 100 and 300 trajectories: .* end together"),
+        (["env=gym", "seeds=[0,1]"], r"got env\.kind='gym'.*--multirun"),
+        (["collector=multi_sync", "seeds=[0,1]"], r"collector=single, got .*'process'"),
+        (["env=copy", "env.distinct_histories=false", "seeds=[0,1]"], "distinct_histories=true"),
+    ],
+)
+def test_what_cannot_be_stacked_is_refused_before_a_directory_is_made(
+    tmp_path, train, options, message
+):
+    with pytest.raises((ValueError, HydraException), match=message):
+        train(tmp_path, *options)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_run_that_breaks_is_named(tmp_path, train, monkeypatch):
@@ -154,33 +204,36 @@ def test_a_run_that_breaks_is_named(tmp_path, train, monkeypatch):
         train(tmp_path, *BANDIT, "seeds=[3,4]")
 
 
-def test_histories_of_different_runs_are_not_shared_and_in_order():
+def test_histories_of_different_runs_are_not_shared_and_in_order(script):
+    """The same order of nodes as alone, so that a run's products have the same factors."""
+    policies = [make_tuple_policy(2, (1, 2, 1), hidden_size=4) for _ in range(3)]
+    core = script("stacked.policies").stack_policies(policies, [torch.get_rng_state()] * 3).core
     symbols = torch.randint(3, (6, 8))
     starts = (torch.arange(6) == 0).unsqueeze(1).expand(6, 8)
     mask = torch.rand(6, 8) < 0.8
     mask[0] = True
     mask = mask.cummin(0).values
     runs = torch.tensor([0, 0, 0, 1, 1, 1, 1, 2])
-    both = distinct_histories(symbols, starts, mask, num_symbols=3, runs=runs, num_runs=3)
+    both = core.find_histories(symbols + core.num_symbols * runs, starts, mask, None)
+    first = torch.tensor(both.counts).cumsum(0) - torch.tensor(both.counts)
     for run in range(3):
         rows = runs == run
-        own = distinct_histories(symbols[:, rows], starts[:, rows], mask[:, rows], num_symbols=3)
+        hashes = hash_histories(symbols[:, rows], starts[:, rows], num_symbols=core.num_symbols)
+        own = distinct_histories(hashes, starts[:, rows], mask[:, rows])
         assert own.counts == [sizes[run] for sizes in both.sizes]
         assert (both.nodes[:, rows] >= 0).equal(own.nodes >= 0)
-        # The same order of nodes, so that a run's products have the same factors.
-        first = torch.tensor(both.counts).cumsum(0) - torch.tensor(both.counts)
         before = torch.tensor([sum(sizes[:run]) for sizes in both.sizes])
         own_first = torch.tensor(own.counts).cumsum(0) - torch.tensor(own.counts)
         within = both.nodes[:, rows] - (first + before).unsqueeze(1)
         assert within[mask[:, rows]].equal((own.nodes - own_first.unsqueeze(1))[mask[:, rows]])
 
 
-def test_a_run_samples_and_steps_as_alone():
+def test_a_run_samples_and_steps_as_alone(script):
     envs = [AlgorithmicEnv("copy", num_groups=2, group_size=3, seed=s) for s in (0, 1)]
     alone = [AlgorithmicEnv("copy", num_groups=2, group_size=3, seed=s) for s in (0, 1)]
     for each in (envs[1], alone[1]):
         each.curriculum.levels.fill_(7)
-    env = stack_envs(envs)
+    env = script("stacked.envs").stack_envs(envs)
     action = torch.randint(2, (4, 3, 3))
     reset = torch.tensor([True, False, False, True]).expand(3, 4).t().unsqueeze(-1)
     for _ in range(3):
@@ -202,7 +255,7 @@ def test_a_run_samples_and_steps_as_alone():
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.float16])
-def test_a_run_draws_as_alone(dtype):
+def test_a_run_draws_as_alone(script, dtype):
     logits, states = torch.zeros(5, 7, dtype=dtype), []
     alone = []
     for seed, rows in ((3, 2), (4, 3)):
@@ -210,25 +263,15 @@ def test_a_run_draws_as_alone(dtype):
         states.append(torch.get_rng_state())
         own = TupleCategorical(logits[:rows], (2, 2, 3))
         alone.append(own.sample())
-    uniform = _RandomStreams(states).uniform([2, 3], logits)
+    uniform = script("stacked.policies").RandomStreams(states).uniform([2, 3], logits)
     assert TupleCategorical(logits, (2, 2, 3)).choose(uniform).equal(torch.cat(alone))
 
 
-def test_policies_see_their_part_of_the_stacked_parameters():
-    actors = [make_tuple_policy(4, (2, 2, 3), hidden_size=8) for _ in range(2)]
-    before = [[parameter.clone() for parameter in actor.parameters()] for actor in actors]
-    stacked = stack_policies(actors, [torch.get_rng_state()] * 2)
-    for whole, *parts in zip(stacked.parameters(), *before, strict=True):
-        assert whole.equal(torch.stack(parts))
-    with torch.no_grad():
-        for whole in stacked.parameters():
-            whole.mul_(2)
-    for actor, old in zip(actors, before, strict=True):
-        assert all(a.equal(2 * b) for a, b in zip(actor.parameters(), old, strict=True))
-
-
 def _softmax_policies():
-    return [make_softmax_policy(torch.eye(3)) for _ in range(2)], TensorDict(batch_size=4)
+    observation = torch.ones(4, 1)
+    return [make_softmax_policy(torch.eye(3)) for _ in range(2)], TensorDict(
+        observation=observation, batch_size=4
+    )
 
 
 def _tuple_policies():
@@ -238,10 +281,10 @@ def _tuple_policies():
 
 
 @pytest.mark.parametrize("make", [_softmax_policies, _tuple_policies])
-def test_rows_must_come_run_after_run(make):
+def test_rows_must_come_run_after_run(script, make):
     """Otherwise a run would get the actions of another."""
     policies, batch = make()
-    stacked = stack_policies(policies, [torch.get_rng_state()] * 2)
+    stacked = script("stacked.policies").stack_policies(policies, [torch.get_rng_state()] * 2)
     with pytest.raises(ValueError, match=r"run after run, got 'run' = \[0, 1, 0, 1\]"):
         stacked(batch.set("run", torch.tensor([0, 1, 0, 1])))
     assert stacked(batch.set("run", torch.tensor([0, 0, 1, 1])))["action"].shape[0] == 4

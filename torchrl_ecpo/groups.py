@@ -33,7 +33,6 @@ TRAJECTORY_KEY: NestedKey = ("collector", "traj_ids")
 DONE_KEY: NestedKey = ("next", "done")
 GROUP_KEY: NestedKey = "group"
 INIT_KEY: NestedKey = "is_init"
-RUN_KEY: NestedKey = "run"  # whose a row is, where several runs are stacked
 
 
 def pack_groups(

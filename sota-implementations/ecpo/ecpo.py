@@ -1,16 +1,28 @@
 """Train ECPO, PMD, UREX or MENT on groups of trajectories: Algorithm 1 and its baselines.
 
 ``python ecpo.py env=bandit loss=ecpo seed=1``; every option is in ``config/``. ``seeds=[0,1,2]``
-trains as many independent runs in one process (``stack.py``).
+and ``stack=[...]`` train several independent runs in one process (``stacked/``).
 """
 
 from __future__ import annotations
 
 import hydra
 import torch
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from stack import make_stack
-from utils import check_config, is_single, make_optimizer, make_parts, reached
+from stacked import runs_of, train_stack
+from tasks import make_task
+from torch.nn.utils import clip_grad_norm_
+from utils import (
+    check_config,
+    is_single,
+    make_collector,
+    make_loss,
+    make_optimizer,
+    make_run,
+    make_temperatures,
+    reached,
+)
 
 from torchrl_ecpo.collectors import shut_down
 from torchrl_ecpo.experiment import Checkpoints, Progress, compile_module
@@ -19,15 +31,22 @@ from torchrl_ecpo.experiment import Checkpoints, Progress, compile_module
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
 def main(config: DictConfig) -> None:
     check_config(config)
-    checkpoints = Checkpoints(config)
     torch.set_num_threads(config.threads)
+    if config.seeds is not None or config.stack is not None:
+        configs = runs_of(config, HydraConfig.get().overrides.task)
+        return train_stack(configs, Checkpoints(config))
 
-    parts = make_parts(config) if config.seeds is None else make_stack(config)
-    task, collector, loss_module, temperatures, run, clip_grad_norm_ = parts
+    checkpoints = Checkpoints(config)
+    torch.manual_seed(config.seed)
+    task = make_task(config)
+    collector = make_collector(config, task)
+    loss_module = make_loss(config.loss, task.actor)
     if config.compile:
         compile_module(loss_module, "loss")
-    optimizer = make_optimizer(config.optim, loss_module)
+    optimizer = make_optimizer(config.optim, loss_module.parameters())
     max_grad_norm = config.optim.max_grad_norm or float("inf")
+    temperatures = make_temperatures(config.loss, loss_module)
+    run = make_run(config, task)
 
     groups_of_trajectories = iter(collector)
     progress = Progress(trajectories=0, project_steps=0, is_annealing=config.anneal_from is None)
@@ -53,8 +72,8 @@ def main(config: DictConfig) -> None:
                 groups = next(groups_of_trajectories)
                 losses = loss_module(groups)
                 optimizer.zero_grad()
-                losses["loss_actor"].sum().backward()  # of stacked runs there is one each
-                grad_norm = clip_grad_norm_(max_grad_norm)
+                losses["loss_actor"].backward()
+                grad_norm = clip_grad_norm_(loss_module.parameters(), max_grad_norm)
                 metrics = {**losses.detach(), "grad_norm": grad_norm}
                 run.check(metrics, progress.trajectories)
                 optimizer.step()

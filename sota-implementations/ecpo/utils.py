@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Iterable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from tasks import Metrics, Task, make_task
+from tasks import Metrics, Task
 from tensordict.nn import ProbabilisticTensorDictSequential
 
 from torchrl_ecpo import ECPOLoss, MENTLoss, PMDLoss, TrajectoryGroupLoss, UREXLoss
@@ -32,10 +32,10 @@ def check_config(config: DictConfig) -> None:
     """Refuse settings with which a run would never end, or never begin."""
     counts = ("total_trajectories", "evaluation_interval", "num_groups", "group_size")
     check_options(config, (*counts, "project_steps"))
-    if config.compile and config.seeds is not None:
+    if config.compile and not (config.seeds is None and config.stack is None):
         raise ValueError(
-            f"compile=true is for single runs, got seeds={config.seeds}. Leave out compile, or "
-            "start a run for each seed: --multirun seed=..."
+            "compile=true is for single runs. Leave out compile, or seeds and stack: --multirun "
+            "starts a process for each run."
         )
     if config.compile and config.env.kind not in COMPILABLE:
         raise ValueError(
@@ -43,28 +43,6 @@ def check_config(config: DictConfig) -> None:
             f"{config.env.kind!r}, whose policy computes each distinct history once: how much that "
             "is differs from batch to batch. Leave out compile."
         )
-
-
-class Parts(NamedTuple):
-    """What a run is made of; of stacked runs (``stack.py``), numbers come as one for each run."""
-
-    task: Task
-    collector: TrajectoryGroupCollector
-    loss_module: Any
-    temperatures: Any
-    run: Any
-    clip_grad_norm_: Callable[[float], torch.Tensor]
-
-
-def make_parts(config: DictConfig) -> Parts:
-    """The parts of a single run."""
-    torch.manual_seed(config.seed)
-    task = make_task(config)
-    collector = make_collector(config, task)
-    loss_module = make_loss(config.loss, task.actor)
-    temperatures = make_temperatures(config.loss, loss_module)
-    clip = partial(torch.nn.utils.clip_grad_norm_, list(loss_module.parameters()))
-    return Parts(task, collector, loss_module, temperatures, make_run(config, task), clip)
 
 
 def make_run(config: DictConfig, task: Task, **options: Any) -> Run:
@@ -111,11 +89,11 @@ def make_loss(config: DictConfig, actor: ProbabilisticTensorDictSequential) -> T
     return LOSSES[config.name](actor, **options)
 
 
-def make_optimizer(config: DictConfig, loss_module: TrajectoryGroupLoss) -> torch.optim.Optimizer:
-    """Adam over the parameters of the actor."""
-    return torch.optim.Adam(
-        loss_module.parameters(), lr=config.lr, eps=config.eps, amsgrad=config.amsgrad
-    )
+def make_optimizer(
+    config: DictConfig, parameters: Iterable[torch.nn.Parameter]
+) -> torch.optim.Optimizer:
+    """Adam."""
+    return torch.optim.Adam(parameters, lr=config.lr, eps=config.eps, amsgrad=config.amsgrad)
 
 
 def make_temperatures(config: DictConfig, loss_module: TrajectoryGroupLoss) -> TemperatureScheduler:
@@ -126,11 +104,8 @@ def make_temperatures(config: DictConfig, loss_module: TrajectoryGroupLoss) -> T
     return TemperatureScheduler(loss_module, **schedules)
 
 
-def reached(goal: DictConfig | None, metrics: Metrics) -> bool | torch.Tensor:
-    """Whether a metric has come up to a goal, ``{metric: ..., at_least: ...}``; always for none.
-
-    Of stacked runs, bool ``[R]``.
-    """
+def reached(goal: DictConfig | None, metrics: Metrics) -> bool:
+    """Whether a metric has come up to a goal, ``{metric: ..., at_least: ...}``; always for none."""
     if goal is None:
         return True
     if goal.metric not in metrics:
@@ -138,15 +113,16 @@ def reached(goal: DictConfig | None, metrics: Metrics) -> bool | torch.Tensor:
             f"anneal_from.metric must be one of {sorted(metrics)}, which every gradient step has, "
             f"got {goal.metric!r}."
         )
-    is_reached = torch.as_tensor(metrics[goal.metric] >= goal.at_least)
-    return is_reached if is_reached.ndim else bool(is_reached)
+    return bool(metrics[goal.metric] >= goal.at_least)
 
 
-def run_name(seed: int, seeds: Any) -> str:
-    """The name of the directory of a run, or of stacked runs, whose seeds are yet to be checked."""
-    return (
-        f"seed_{seed}" if seeds is None else "seeds_" + re.sub(r"\W+", "_", str(seeds)).strip("_")
-    )
+def run_name(loss: str, seed: int, seeds: Any, stack: Any) -> str:
+    """The directory of a run, or of stacked runs, whose options are yet to be checked."""
+    if stack is not None:
+        return "stack"
+    if seeds is None:
+        return f"{loss}/seed_{seed}"
+    return f"{loss}/seeds_" + re.sub(r"\W+", "_", str(seeds)).strip("_")
 
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)

@@ -27,15 +27,16 @@ MANIFESTS = [HERE / "study.yaml", HERE / "search.yaml"]
 KINDS = ("curves", "heat_map", "ranking")
 RANKS = ("area", "final")
 # Runs that differ in these alone have the same numbers, as far as both go: the entries of env are
-# those that other entries are read from, the last is how Q networks are called.
+# those that other entries are or were read from, the last is how Q networks are called.
 NOT_THE_RUN = (
-    *("resume", "checkpoint", "logger", "threads", "compile"),
-    *("env.settings", "env.optim", "env.cracked", "env.evaluation_interval"),
+    *("resume", "checkpoint", "logger", "threads", "compile", "stack"),
+    *("env.settings", "env.optim", "env.cracked", "env.num_groups", "env.evaluation_interval"),
     "loss.options.deactivate_vmap",
 )
 # Entries that the scripts no longer have, with the one value that is left: older runs have them.
 GONE = {
     "env.head": "masked",  # the action's parts; independent factors and one softmax had no result
+    "loss.length_normalised": False,  # of the entropy term of a lift; true had no result
 }
 
 Entry = TypeVar("Entry")
@@ -162,13 +163,14 @@ def identity(config: DictConfig) -> dict[str, float | str]:
 def changed_entries(
     old: Mapping[str, object], new: Mapping[str, object], ignored: Sequence[str] = ()
 ) -> list[str]:
-    """What differs between two runs, in words; but for entries that are ignored.
+    """What differs between two runs, in words; but for `NOT_THE_RUN` and entries that are ignored.
 
     Examples:
         >>> changed_entries({"tau": 0.5, "a.b": 1}, {"tau": 0.1}, ignored=["a"])
         ['tau was 0.5, is 0.1']
     """
     changes = differences({**GONE, **old}, {**GONE, **new})
+    ignored = (*NOT_THE_RUN, *ignored)
     return [words for name, words in changes.items() if not _is_below(name, ignored)]
 
 

@@ -24,7 +24,7 @@ from torchrl.modules import (
 
 from torchrl_ecpo.envs import AlgorithmicEnv
 from torchrl_ecpo.modules import DistinctHistoryLSTM, TupleCategorical, make_tuple_policy
-from torchrl_ecpo.modules.histories import distinct_histories, hash_states, mix
+from torchrl_ecpo.modules.histories import distinct_histories, hash_histories, hash_states, mix
 
 DTYPES = [torch.float32, torch.float64]
 NVEC = (3, 2, 4)
@@ -172,7 +172,8 @@ def test_distinct_histories_against_a_dictionary(seed: int) -> None:
     lengths = torch.randint(1, steps + 1, (rows,))
     mask = torch.arange(steps).unsqueeze(1) < lengths
     first_hashes = torch.randint(2**62, (4,))[torch.randint(4, (rows,))]
-    histories = distinct_histories(symbols, starts, mask, num_symbols=2, first_hashes=first_hashes)
+    hashes = hash_histories(symbols, starts, num_symbols=2, first_hashes=first_hashes)
+    histories = distinct_histories(hashes, starts, mask)
 
     numbers: dict[Any, int] = {}
     previous: list[Any] = [(first_hashes[n].item(),) for n in range(rows)]
@@ -348,32 +349,6 @@ def test_a_trajectory_of_padding_alone() -> None:
     assert (logits[3] != 0).any()
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_update_from_stored_states(dtype: torch.dtype) -> None:
-    data = sequences("restarts", 6, steps=6)
-    data["is_init"][3:, 0] = False
-    states = {}
-    for name in ("recurrent_state_h", "recurrent_state_c"):
-        first = torch.zeros(6, 1, 16, dtype=dtype)
-        first[3:5] = torch.randn(1, 16, dtype=dtype)
-        first[5] = torch.randn(1, 16, dtype=dtype)
-        states[name] = first.requires_grad_()
-    results = []
-    for policy in both_policies(dtype, store_states=True):
-        copy = data.clone()
-        for name, first in states.items():
-            # LSTMModule takes what it finds where a trajectory starts.
-            copy[name] = torch.cat([first.unsqueeze(1), torch.zeros(6, 5, 1, 16, dtype=dtype)], 1)
-        with set_recurrent_mode(True):
-            logits = policy.get_dist(copy).logits
-        gradients = torch.autograd.grad(logits.square().sum(), list(states.values()))
-        # Rows 3 and 4 are one history, whose gradient goes to one of them; that of rows that
-        # start is none of the state's, as LSTMModule has it.
-        results.append([logits, *(g[3] + g[4] for g in gradients), *(g[5] for g in gradients)])
-    for ours, plain in zip(*results, strict=True):
-        assert_close(ours, plain)
-
-
 def step_inputs(data: TensorDict, t: int, before: TensorDict | None) -> TensorDict:
     inputs = data[:, t].clone()
     if before is not None:
@@ -466,9 +441,9 @@ def test_functional_call_and_copies() -> None:
     assert not list(policy.buffers())
 
 
-def copy_policy(store_states: bool = False) -> Any:
+def copy_policy() -> Any:
     torch.manual_seed(0)
-    return make_tuple_policy(6, (2, 2, 5), hidden_size=16, store_states=store_states)
+    return make_tuple_policy(6, (2, 2, 5), hidden_size=16)
 
 
 def copy_env(policy: Any = None) -> TransformedEnv:
@@ -477,16 +452,15 @@ def copy_env(policy: Any = None) -> TransformedEnv:
     return TransformedEnv(env, policy and get_env_transforms_from_module(policy))
 
 
-@pytest.mark.parametrize("store_states", [False, True])
-def test_rollout(store_states: bool) -> None:
-    policy = copy_policy(store_states)
+def test_rollout() -> None:
+    policy = copy_policy()
     data = copy_env(policy).rollout(20, policy, break_when_any_done=False)
     assert data["is_init"][..., 1:, :].any()
     with set_recurrent_mode(True):
         log_prob = policy.get_dist(data).log_prob(data["action"])
     assert_close(log_prob, data["action_log_prob"])
     for key in ("recurrent_state_h", ("next", "recurrent_state_h")):
-        assert (key in data.keys(True)) is store_states
+        assert key not in data.keys(True)
 
 
 @pytest.mark.parametrize("automatic", [False, True])
@@ -509,9 +483,8 @@ def test_collector(automatic: bool) -> None:
     collector.shutdown()
 
 
-@pytest.mark.parametrize("store_states", [False, True])
-def test_fragments_of_trajectories_need_stored_states(store_states: bool) -> None:
-    policy = copy_policy(store_states)
+def test_fragments_of_trajectories_are_refused() -> None:
+    policy = copy_policy()
     collector = Collector(
         copy_env(policy),
         policy,
@@ -522,13 +495,8 @@ def test_fragments_of_trajectories_need_stored_states(store_states: bool) -> Non
     *_, data = collector
     collector.shutdown()
     assert not data["is_init"][..., 0, :].all()
-    with set_recurrent_mode(True):
-        if not store_states:
-            with pytest.raises(ValueError, match=r"states are not stored.* store_states=True"):
-                policy.module[0](data)
-            return
-        log_prob = policy.get_dist(data).log_prob(data["action"])
-    assert_close(log_prob, data["action_log_prob"])
+    with set_recurrent_mode(True), pytest.raises(ValueError, match="states are not stored"):
+        policy.module[0](data)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from torchrl_ecpo.envs.algorithmic import TASKS, AlgorithmicEnv, AlgorithmicTask
 from torchrl_ecpo.envs.bandit import BanditEnv
 from torchrl_ecpo.envs.grouped import GroupedEnv
 from torchrl_ecpo.envs.replay import EpisodeReplay
-from torchrl_ecpo.envs.stacked import stack_envs
 
 __all__ = [
     "TASKS",
@@ -15,5 +14,4 @@ __all__ = [
     "EpisodeReplay",
     "GroupIdAllocator",
     "GroupedEnv",
-    "stack_envs",
 ]

@@ -9,7 +9,6 @@ from torchrl_ecpo.modules.actor_critic import (
 )
 from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
 from torchrl_ecpo.modules.softmax import LinearSoftmax, SharedCategorical, make_softmax_policy
-from torchrl_ecpo.modules.stacked import stack_policies
 from torchrl_ecpo.modules.tuple_policy import TupleCategorical, make_tuple_policy
 
 __all__ = [
@@ -24,5 +23,4 @@ __all__ = [
     "make_tanh_gaussian_actor",
     "make_tuple_policy",
     "make_value_network",
-    "stack_policies",
 ]

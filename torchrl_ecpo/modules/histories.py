@@ -1,9 +1,7 @@
 """Distinct histories: which rows of a batch share a past, and an LSTM over those alone.
 
-Shapes: R rows at one step; N rows of T steps; n distinct histories ("nodes"); H hidden units. Nodes
-are ordered by step, so that the nodes of one step form a contiguous block, and a node's parent is
-the history that it extends by one step. Rows may belong to different runs of a stack, each with
-weights of its own: then they share no histories, and the nodes of a block are ordered by run.
+Shapes: N rows of T steps; n distinct histories ("nodes"); H hidden units. Nodes are ordered by
+step, within a step by their hash; a node's parent is the history that it extends by one step.
 """
 
 from __future__ import annotations
@@ -19,14 +17,7 @@ _PADDING = torch.iinfo(torch.int64).max
 
 
 def mix(x: Tensor) -> Tensor:
-    """Scramble int64 values: the (bijective) finaliser of splitmix64, by Steele et al. (2014).
-
-    Args:
-        x: int64, any shape.
-
-    Returns:
-        int64 of the same shape.
-    """
+    """Scramble int64 values: the (bijective) finaliser of splitmix64, by Steele et al. (2014)."""
     x = _fold(x + 0x1E3779B97F4A7C15, 30) * -0x40A7B892E31B1A47
     return _fold(_fold(x, 27) * -0x6B2FB644ECCEEE15, 31)
 
@@ -37,18 +28,12 @@ def _fold(x: Tensor, bits: int) -> Tensor:
 
 
 def hash_states(*states: Tensor) -> Tensor:
-    """Hash recurrent states by their bits, so that equal rows, and they alone, get equal hashes.
+    """Hash recurrent states `[N, H]` by their bits: int64 `[N]`, equal for equal rows alone.
 
     Multilinear hashing modulo 2^64 with odd multipliers: two states that differ in one word never
     collide; two that differ in several do with probability 2^-(64 - z), z the trailing zeros common
     to all differences of words. States of a network differ in their lowest bits, z = 0: for 400
     rows, 8e4 pairs, that makes 4e-15 a step. Where only signs differ, z is 22.
-
-    Args:
-        states: floating point, each `[R, H]`.
-
-    Returns:
-        int64 `[R]`.
     """
     total = torch.zeros((), dtype=torch.int64, device=states[0].device)
     for i, state in enumerate(states):
@@ -67,6 +52,36 @@ def _multipliers(size: int, stream: int, device: torch.device) -> Tensor:
     return mix(torch.arange(size, device=device) + (stream << 32)) | 1
 
 
+def hash_histories(
+    symbols: Tensor, starts: Tensor, *, num_symbols: int, first_hashes: Tensor | None = None
+) -> Tensor:
+    """Hash the history of each row at each step, the sequence of symbols since its last start.
+
+    A hash is the sum, modulo 2^64, of scrambled (step, symbol) pairs: two different histories at
+    one step collide with probability 2^-64, so a batch of 400 rows and 66 steps, 5e6 pairs, does
+    with 3e-13.
+
+    Args:
+        symbols: int64 `[T, N]` in [0, num_symbols).
+        starts: bool `[T, N]`, True where a sequence starts from the zero state.
+        num_symbols: the number of different symbols.
+        first_hashes: int64 `[N]`, the hash of the state that a row continues from where its first
+            step is no start. None where every row starts at its first step.
+
+    Returns:
+        int64 `[T, N]`.
+    """
+    step = torch.arange(len(symbols), device=symbols.device).unsqueeze(1)
+    terms = mix(step * num_symbols + symbols)
+    if first_hashes is not None:
+        terms[0] += first_hashes.masked_fill(starts[0], 0)
+    hashes = terms.cumsum(0)
+    if starts[1:].any():
+        start = torch.where(starts, step, 0).cummax(0).values
+        hashes = hashes - (hashes - terms).gather(0, start)
+    return hashes
+
+
 class _Block(NamedTuple):
     """The nodes of a step."""
 
@@ -76,11 +91,10 @@ class _Block(NamedTuple):
     continues: Tensor | None
     """A bool column that is False for those that start from the zero state, None if none does."""
     sizes: list[int] | None
-    """How many there are of each run; None without runs."""
 
 
 class Histories(NamedTuple):
-    """The distinct histories of a batch `[N, T]`.
+    """The distinct histories of a batch.
 
     Attributes:
         counts: the number of nodes at each step.
@@ -89,7 +103,8 @@ class Histories(NamedTuple):
             the first step: into the initial states); -1 for a node that starts from the zero state.
         rows: int64 `[n]`, one place of each node in the batch, flattened from `[T, N]`.
         nodes: int64 `[T, N]`, the node at each place of the batch; -1 at padded steps.
-        sizes: the number of nodes of each run at each step; None without runs.
+        sizes: where there are several cells, how many of a step's nodes each has, one cell's after
+            the other's.
     """
 
     counts: list[int]
@@ -116,58 +131,25 @@ class Histories(NamedTuple):
         return [block for count, block in zip(self.counts, blocks, strict=True) if count]
 
 
-def distinct_histories(
-    symbols: Tensor,
-    starts: Tensor,
-    mask: Tensor | None = None,
-    *,
-    num_symbols: int,
-    first_hashes: Tensor | None = None,
-    runs: Tensor | None = None,
-    num_runs: int = 1,
-) -> Histories:
+def distinct_histories(hashes: Tensor, starts: Tensor, mask: Tensor | None = None) -> Histories:
     """Find the distinct histories of a batch of sequences.
 
-    A history is the sequence of symbols since the last start. Its hash is the sum, modulo 2^64, of
-    scrambled (step, symbol) pairs: two different histories at one step collide with probability
-    2^-64, so a batch of 400 rows and 66 steps, 5e6 pairs, does with 3e-13.
-
     Args:
-        symbols: int64 `[T, N]` in [0, num_symbols).
-        starts: bool `[T, N]`, True where a sequence starts from the zero state.
+        hashes: int64 `[T, N]`, equal for equal histories: :func:`hash_histories`.
+        starts: bool `[T, N]`, True where a sequence starts from the zero state. Row i continues
+            from initial state i where its first step is no start.
         mask: bool `[T, N]`, False at padded steps; None where all are real.
-        num_symbols: the number of different symbols.
-        first_hashes: int64 `[N]`, the hash of the state that a row continues from where its first
-            step is no start. Row i then continues from initial state i. None where every row starts
-            at its first step.
-        runs: int64 `[N]` in [0, num_runs), the run that each row belongs to; None for one run.
-        num_runs: the number of runs.
 
     Returns:
         The histories.
     """
-    num_steps, num_rows = symbols.shape
-    step = torch.arange(num_steps, device=symbols.device).unsqueeze(1)
-    terms = mix(step * num_symbols + symbols)
-    if first_hashes is not None:
-        terms[0] += first_hashes.masked_fill(starts[0], 0)
-    keys = terms.cumsum(0)
-    if starts[1:].any():
-        start = torch.where(starts, step, 0).cummax(0).values
-        keys = keys - (keys - terms).gather(0, start)
+    num_steps, num_rows = hashes.shape
+    step = torch.arange(num_steps, device=hashes.device).unsqueeze(1)
     if mask is not None:
-        keys = keys.masked_fill(~mask, _PADDING)
-
-    keys, order = keys.sort(1)
-    if runs is not None:
-        # The sort by run is stable, so that a run's nodes are ordered as if it were alone.
-        by_run, within = runs[order].sort(dim=1, stable=True)
-        keys, order = keys.gather(1, within), order.gather(1, within)
-    differs = keys[:, 1:] != keys[:, :-1]
-    if runs is not None:
-        differs |= by_run[:, 1:] != by_run[:, :-1]
-    new = keys != _PADDING
-    new[:, 1:] &= differs
+        hashes = hashes.masked_fill(~mask, _PADDING)
+    hashes, order = hashes.sort(1)
+    new = hashes != _PADDING
+    new[:, 1:] &= hashes[:, 1:] != hashes[:, :-1]
     # Nodes are numbered within their step first, as parents are.
     nodes = torch.empty_like(order).scatter_(1, order, new.cumsum(1) - 1)
     if mask is not None:
@@ -180,11 +162,7 @@ def distinct_histories(
     started = torch.zeros_like(counts).index_add_(0, rows // num_rows, (parents < 0).long())
     first = (counts.cumsum(0) - counts).unsqueeze(1)
     nodes = torch.where(nodes < 0, nodes, nodes + first)
-    sizes = None
-    if runs is not None:
-        place = rows // num_rows * num_runs + runs[rows % num_rows]
-        sizes = place.bincount(minlength=num_steps * num_runs).view(num_steps, -1).tolist()
-    return Histories(counts.tolist(), started.tolist(), parents, rows, nodes, sizes)
+    return Histories(counts.tolist(), started.tolist(), parents, rows, nodes)
 
 
 class LSTMOverHistories(torch.autograd.Function):
@@ -193,34 +171,34 @@ class LSTMOverHistories(torch.autograd.Function):
     Equal to `torch.nn.LSTM` on each row. It has its own backward because autograd through a loop
     over steps takes about twice as long: it keeps every intermediate, and fresh memory is dear.
 
-    `apply(projections, weight_hh, h_0, c_0, symbols, histories) -> (h, c, gates)`
+    `apply(projections, h_0, c_0, symbols, histories, *weights) -> (h, c, gates)`
 
     - projections `[S, 4H]`: the input's part of the gates for each symbol, biases included, in
       PyTorch's order (input, forget, cell, output);
-    - weight_hh `[4H, H]`, or one for each run, `[runs, 4H, H]`;
     - h_0, c_0 `[N, H]`: the initial states, None where every row starts from zero;
     - symbols int64 `[n]`: the symbol that each node ends with, as a row of `projections`;
+    - weights: weight_hh `[4H, H]`, of each cell if there are several (`histories.sizes`);
     - h, c `[n, H]`: the state after each node; gates `[n, 4H]`: activations, not differentiable.
     """
 
     @staticmethod
     def forward(
         projections: Tensor,
-        weight_hh: Tensor,
         h_0: Tensor | None,
         c_0: Tensor | None,
         symbols: Tensor,
         histories: Histories,
+        *weights: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Evaluate the cell step by step; see the class."""
-        hidden = weight_hh.shape[-1]
+        hidden = weights[0].shape[-1]
         # tanh(x) = 2 sigmoid(2x) - 1: doubling the cell gate's inputs lets one vectorised sigmoid
         # serve all gates, at a third of tanh's time.
-        scale = weight_hh.new_ones(4, hidden)
+        scale = projections.new_ones(4, hidden)
         scale[2] = 2
         scale = scale.flatten()
         gates = (projections * scale).index_select(0, symbols)
-        weights = _of_runs((weight_hh * scale.unsqueeze(1)).mT)
+        scaled = [(weight * scale.unsqueeze(1)).mT for weight in weights]
         h, c = gates.new_empty(len(symbols), hidden), gates.new_empty(len(symbols), hidden)
         # The first step reads them only where it continues.
         before_h, before_c = cast(Tensor, h_0), cast(Tensor, c_0)
@@ -228,9 +206,8 @@ class LSTMOverHistories(torch.autograd.Function):
             gate = gates[block]
             if parent is not None:
                 past = _gather(before_h, parent, continues)
-                for own, *factors in zip(
-                    _parts(gate, sizes), _parts(past, sizes), weights, strict=True
-                ):
+                gates_of, past_of = _parts(gate, sizes), _parts(past, sizes)
+                for own, *factors in zip(gates_of, past_of, scaled, strict=True):
                     own.addmm_(*factors)
             i, f, g, o = gate.sigmoid_().split(hidden, 1)
             g.mul_(2).sub_(1)
@@ -244,22 +221,21 @@ class LSTMOverHistories(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
         """Keep what the backward needs."""
-        projections, weight_hh, h_0, c_0, symbols, histories = inputs
+        projections, h_0, c_0, symbols, histories, *weights = inputs
         h, c, gates = output
         ctx.mark_non_differentiable(gates)
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(weight_hh, h_0, c_0, symbols, h, c, gates)
+        ctx.save_for_backward(h_0, c_0, symbols, h, c, gates, *weights)
         ctx.histories, ctx.num_symbols = histories, len(projections)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_h: Tensor | None, grad_c: Tensor | None, _: None) -> tuple:
         """Go back through the steps, each node's gradient flowing into its parent's."""
-        weight, h_0, c_0, symbols, h, c, gates = ctx.saved_tensors
-        hidden = weight.shape[-1]
-        grad_projections = weight.new_zeros(ctx.num_symbols, 4 * hidden)
-        grad_weight = torch.zeros_like(weight)
-        weights, grad_weights = _of_runs(weight), _of_runs(grad_weight)
+        h_0, c_0, symbols, h, c, gates, *weights = ctx.saved_tensors
+        hidden = h.shape[-1]
+        grad_projections = h.new_zeros(ctx.num_symbols, 4 * hidden)
+        grad_weights = [torch.zeros_like(weight) for weight in weights]
         blocks = ctx.histories.blocks()
         grad_h = torch.zeros_like(h) if grad_h is None else grad_h
         child_h = child_c = None  # what flows in from the next step
@@ -292,21 +268,16 @@ class LSTMOverHistories(torch.autograd.Function):
                 grads = _parts(grad, sizes)
                 for own, of_gates, of_past in zip(grad_weights, grads, past, strict=True):
                     own.addmm_(of_gates.t(), of_past)
-                back = [own @ matrix for own, matrix in zip(grads, weights, strict=True)]
+                back = [own @ weight for own, weight in zip(grads, weights, strict=True)]
                 grad_past = back[0] if len(back) == 1 else torch.cat(back)
                 child_h = _scatter(grad_past, parent, continues, len(before_h))
                 child_c = _scatter(dc.mul_(f), parent, continues, len(before_h))
             grad_projections.index_add_(0, symbols[block], grad)
-        return grad_projections, grad_weight, child_h, child_c, None, None
-
-
-def _of_runs(weight: Tensor) -> tuple[Tensor, ...]:
-    """The weight of each run, or the only one."""
-    return weight.unbind(0) if weight.ndim == 3 else (weight,)
+        return grad_projections, child_h, child_c, None, None, *grad_weights
 
 
 def _parts(x: Tensor, sizes: list[int] | None) -> tuple[Tensor, ...]:
-    """The rows of each run, or all of them."""
+    """The rows of each cell, or all of them."""
     return (x,) if sizes is None else x.split(sizes)
 
 

@@ -20,10 +20,13 @@ from torchrl_ecpo.modules.histories import (
     Histories,
     LSTMOverHistories,
     distinct_histories,
+    hash_histories,
     hash_states,
 )
 
 __all__ = ["DistinctHistoryLSTM"]
+
+STATE_KEYS = ("recurrent_state_h", "recurrent_state_c")  # each `[*B, 1, H]`, as with LSTMModule
 
 
 class DistinctHistoryLSTM(TensorDictModuleBase):
@@ -41,10 +44,10 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
       compared by the state's bits. So nothing is remembered between calls: rows may be dropped,
       reordered or moved to another process, and weights may change. Rows whose root `done` is set
       have ended: they share one zero state.
-    - Recurrent mode: padded steps, by `("collector", "mask")` where it is there, cost nothing and
-      give zeros. Gradients are exact (once: no second derivatives); where equal states are given
-      to begin with, one of them gets the gradient of all. No states are written: the update needs
-      none.
+    - Recurrent mode: every sequence begins with a trajectory's first step. Padded steps, by
+      `("collector", "mask")` where it is there, cost nothing and give zeros. Gradients are exact
+      (once: no second derivatives). No states are written, nor do they stay in collected data, of
+      which they would be the most: the update needs none.
 
     Args:
         num_classes: the number of classes of each input, in the order of the input keys and of
@@ -54,11 +57,6 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
             layer to logits. Default None: the output is the LSTM's.
         in_keys: the integer inputs, each `[*B]` or `[*B, d]`.
         out_key: the output. Default "embed".
-        state_key: the states' keys are this with "_h" and "_c" appended, each `[*B, 1, H]`. Default
-            "recurrent_state", as with `LSTMModule`.
-        store_states: whether the states stay in collected data, where they are needed only for
-            sequences that begin in the middle of a trajectory. Default False: they would take most
-            of a rollout's memory.
         device: of the parameters.
         dtype: of the parameters.
 
@@ -68,7 +66,8 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
 
     Raises:
         KeyError: if `is_init` is missing, or the state of a row that continues.
-        ValueError: if an input is out of range, or there is no time dimension in recurrent mode.
+        ValueError: if an input is out of range; in recurrent mode without a time dimension, or for
+            a sequence that begins in the middle of a trajectory.
 
     Examples:
         >>> import torch
@@ -95,8 +94,6 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
         *,
         in_keys: Sequence[NestedKey],
         out_key: str = "embed",
-        state_key: str = "recurrent_state",
-        store_states: bool = False,
         device: torch.device | str | None = None,
         dtype: torch.dtype | None = None,
     ) -> None:
@@ -108,13 +105,12 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
                 "num_classes: expected positive numbers with a product of at most 2^31, got "
                 f"{self.num_classes}."
             )
-        states = (f"{state_key}_h", f"{state_key}_c")
         self.input_keys = list(in_keys)
-        all_keys: list[Any] = [*in_keys, *states, "is_init"]
+        all_keys: list[Any] = [*in_keys, *STATE_KEYS, "is_init"]
         self.in_keys = all_keys
-        out_keys: list[Any] = [out_key, *(("next", key) for key in states)]
+        out_keys: list[Any] = [out_key, *(("next", key) for key in STATE_KEYS)]
         self.out_keys = out_keys
-        self.state_keys, self.store_states = states, store_states
+        self.hidden_size = hidden_size
         self.cell = nn.LSTMCell(sum(num_classes), hidden_size, device=device, dtype=dtype)
         self.readout = readout if readout is not None else nn.Identity()
 
@@ -124,9 +120,9 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
         Returns:
             A :class:`torchrl.envs.TensorDictPrimer`; collectors append it by themselves.
         """
-        primer = TensorDictPrimer if self.store_states else _TransientPrimer
-        spec = Unbounded(torch.Size((1, self.cell.hidden_size)), dtype=self.cell.weight_hh.dtype)
-        return primer(dict.fromkeys(self.state_keys, spec), expand_specs=True)
+        dtype = next(self.parameters()).dtype
+        spec = Unbounded(torch.Size((1, self.hidden_size)), dtype=dtype)
+        return _TransientPrimer(dict.fromkeys(STATE_KEYS, spec), expand_specs=True)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the output; in sampling also the next states.
@@ -145,7 +141,7 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
                 "environment."
             )
         shape = tensordict.shape
-        symbols, starts = self._symbols(tensordict), is_init.reshape(shape)
+        symbols, starts = self.read_symbols(tensordict), is_init.reshape(shape)
         if recurrent_mode():
             if not shape:
                 raise ValueError(
@@ -155,7 +151,12 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
             mask = tensordict.get(("collector", "mask"), None)
             starts = starts if mask is None else starts | ~mask
             symbols, starts, mask = (_time_first(x) for x in (symbols, starts, mask))
-            nodes, output, *_ = self._run(symbols, starts, mask, self._states(tensordict, starts))
+            if not starts[0].all():
+                raise ValueError(
+                    "is_init: expected every sequence to begin with a trajectory's first step, "
+                    "since states are not stored, and some do not; keep trajectories whole."
+                )
+            nodes, output, *_ = self.evaluate(symbols, starts, mask)
             return tensordict.set(self.out_keys[0], _rows(output, nodes.t(), shape))
 
         ended = tensordict.get("done", None)
@@ -163,33 +164,43 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
             ended = ended.reshape(shape)
             starts, symbols = starts | ended, symbols.masked_fill(ended, 0)
         symbols, starts = symbols.reshape(1, -1), starts.reshape(1, -1)
-        nodes, *values = self._run(symbols, starts, None, self._states(tensordict, starts))
+        nodes, *values = self.evaluate(symbols, starts, states=self._states(tensordict, starts))
         nodes = nodes.view(-1)
         for key, value, ndim in zip(self.out_keys, values, (0, 1, 1), strict=True):
             tensordict.set(key, value.index_select(0, nodes).view(*shape, *(1,) * ndim, -1))
         return tensordict
 
-    def _run(
+    def evaluate(
         self,
         symbols: Tensor,
         starts: Tensor,
-        mask: Tensor | None,
-        states: tuple[Tensor, Tensor] | None,
+        mask: Tensor | None = None,
+        states: tuple[Tensor, Tensor] | None = None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Of sequences `[T, N]`, the node at each place; each node's output, h and c `[n, *]`."""
+        """Evaluate the distinct histories of sequences, on plain tensors.
+
+        Args:
+            symbols: int64 `[T, N]`, the inputs of a step as one number.
+            starts: bool `[T, N]`, True where a sequence starts from the zero state.
+            mask: bool `[T, N]`, False at padded steps. Default None: all are real.
+            states: h and c `[N, H]` that rows continue from. Default None: all start.
+
+        Returns:
+            The node at each place, `[T, N]`; each node's output, h and c, `[n, *]`.
+        """
         first_hashes = None if states is None else hash_states(*states)
-        histories = self._histories(symbols, starts, mask, first_hashes)
+        histories = self.find_histories(symbols, starts, mask, first_hashes)
         last_symbols = symbols.flatten()[histories.rows]
         present, node_symbols = last_symbols.unique(return_inverse=True)
         lstm = LSTMOverHistories
         h, c, _ = (lstm.apply if torch.is_grad_enabled() else lstm.forward)(
-            self._project(present),
-            self.cell.weight_hh,
+            self.project(present),
             *((None, None) if states is None else states),
             node_symbols,
             histories,
+            *self.recurrent_weights,
         )
-        output = self._read_out(h, last_symbols)
+        output = self.read_out(h, last_symbols)
         nodes = histories.nodes
         if mask is not None:
             # Node -1, the padding, is the last row.
@@ -197,18 +208,9 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
             nodes = nodes.masked_fill(nodes < 0, len(output) - 1)
         return nodes, output, h, c
 
-    def _histories(
-        self, symbols: Tensor, starts: Tensor, mask: Tensor | None, first_hashes: Tensor | None
-    ) -> Histories:
-        return distinct_histories(
-            symbols, starts, mask, num_symbols=self.num_symbols, first_hashes=first_hashes
-        )
+    # ------------------------------------------------------------------- parts of evaluate
 
-    def _read_out(self, h: Tensor, symbols: Tensor) -> Tensor:
-        """The output of each node, from its state `[n, H]` and last symbol `[n]`."""
-        return self.readout(h)
-
-    def _symbols(self, tensordict: TensorDictBase) -> Tensor:
+    def read_symbols(self, tensordict: TensorDictBase) -> Tensor:
         """The input tuple as one number, int64 `[*B]`."""
         inputs = [tensordict.get(key) for key in self.input_keys]
         ndim = tensordict.ndim
@@ -227,39 +229,46 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
             )
         return (classes * weights).sum(-1)
 
-    def _project(self, symbols: Tensor) -> Tensor:
-        """The input's part of the gates, `[S, 4H]`: a one-hot product is a sum of columns."""
-        columns = F.embedding_bag(
-            self._hot(symbols), self.cell.weight_ih.t().contiguous(), mode="sum"
+    def find_histories(
+        self, symbols: Tensor, starts: Tensor, mask: Tensor | None, first_hashes: Tensor | None
+    ) -> Histories:
+        """The distinct histories of symbols `[T, N]`."""
+        hashes = hash_histories(
+            symbols, starts, num_symbols=self.num_symbols, first_hashes=first_hashes
         )
-        return columns + (self.cell.bias_ih + self.cell.bias_hh)
+        return distinct_histories(hashes, starts, mask)
 
-    def _hot(self, symbols: Tensor) -> Tensor:
-        """Where the one-hot vectors `[S, sum(num_classes)]` of symbols are 1."""
+    def project(self, symbols: Tensor) -> Tensor:
+        """The input's part of the gates for symbols `[S]`, with the biases: `[S, 4H]`."""
+        return self.project_by(self.cell, symbols)
+
+    @property
+    def recurrent_weights(self) -> Sequence[Tensor]:
+        """weight_hh `[4H, H]` of each cell."""
+        return (self.cell.weight_hh,)
+
+    def read_out(self, h: Tensor, symbols: Tensor) -> Tensor:
+        """The output of each node, from its state `[n, H]` and last symbol `[n]`."""
+        return self.readout(h)
+
+    def project_by(self, cell: nn.LSTMCell, symbols: Tensor) -> Tensor:
+        """The same by a given cell. A one-hot product is a sum of columns."""
         sizes, weights, offsets, *_ = _radix(self.num_classes, symbols.device)
-        return symbols.unsqueeze(-1) // weights % sizes + offsets
+        hot = symbols.unsqueeze(-1) // weights % sizes + offsets
+        columns = F.embedding_bag(hot, cell.weight_ih.t().contiguous(), mode="sum")
+        return columns + (cell.bias_ih + cell.bias_hh)
 
     def _states(self, tensordict: TensorDictBase, starts: Tensor) -> tuple[Tensor, Tensor] | None:
-        """The states `[N, H]` that rows continue from; None where all start."""
-        h, c = (tensordict.get(key, None) for key in self.state_keys)
-        # A single step with states can do without the question.
-        if (recurrent_mode() or h is None or c is None) and starts[0].all():
+        """The states `[N, H]` that the rows of a step continue from; None where all start."""
+        h, c = (tensordict.get(key, None) for key in STATE_KEYS)
+        if h is not None and c is not None:
+            return h.reshape(-1, h.shape[-1]), c.reshape(-1, c.shape[-1])
+        if starts.all():
             return None
-        if recurrent_mode() and not self.store_states:
-            raise ValueError(
-                "is_init: expected every sequence to begin with a trajectory's first step, since "
-                "states are not stored, and some do not; keep trajectories whole, or make the "
-                "policy with store_states=True."
-            )
-        if h is None or c is None:
-            raise KeyError(
-                f"{self.state_keys}: expected the states of rows that continue a trajectory, found "
-                "none; append this module's make_tensordict_primer() to the environment."
-            )
-        # [*B, 1, H]; of a sequence, the first.
-        if recurrent_mode():
-            h, c = h[..., 0, :, :], c[..., 0, :, :]
-        return h.reshape(-1, h.shape[-1]), c.reshape(-1, c.shape[-1])
+        raise KeyError(
+            f"{STATE_KEYS}: expected the states of rows that continue a trajectory, found "
+            "none; append this module's make_tensordict_primer() to the environment."
+        )
 
 
 class _TransientPrimer(TensorDictPrimer):

@@ -199,7 +199,6 @@ def make_tuple_policy(
     *,
     hidden_size: int = 128,
     distinct_histories: bool = True,
-    store_states: bool = False,
     device: torch.device | str | None = None,
     dtype: torch.dtype | None = None,
 ) -> ProbabilisticActor:
@@ -218,7 +217,6 @@ def make_tuple_policy(
         distinct_histories: whether rows with equal histories are computed once
             (:class:`DistinctHistoryLSTM`), or each row by :class:`torchrl.modules.LSTMModule`. The
             numbers and the order of the parameters are the same.
-        store_states: see :class:`DistinctHistoryLSTM`; `LSTMModule` always stores them.
         device: of the parameters.
         dtype: of the parameters.
 
@@ -261,7 +259,6 @@ def make_tuple_policy(
             readout=readout,
             in_keys=inputs,
             out_key="logits",
-            store_states=store_states,
             **factory,
         )
     else:

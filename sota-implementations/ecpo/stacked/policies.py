@@ -1,0 +1,222 @@
+"""The policies of all runs as one, over rows that come run after run.
+
+An entry ``run`` says whose each row is. The runs share what does not depend on the weights, and
+every elementwise operation; matrix products are made run by run, on the same rows in the same order
+as by a run alone, so that its numbers are the same. The modules are those of the runs' own
+policies: a gradient arrives where the run alone would have it.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.modules import set_recurrent_mode
+
+from torchrl_ecpo.modules import DistinctHistoryLSTM, TupleCategorical
+from torchrl_ecpo.modules.histories import Histories, distinct_histories, hash_histories
+
+BITS_OF_RUN = 10  # of the hash of a history: two collide with probability 2^-54
+
+
+def stack_policies(actors: Sequence[Any], random_states: Sequence[Tensor]) -> StackedPolicy:
+    """Put the policies of all runs behind one.
+
+    Args:
+        actors: one for each run.
+        random_states: of the random generator that each run samples with, as
+            `torch.get_rng_state` gives them.
+    """
+    is_recurrent = isinstance(actors[0].module[0], DistinctHistoryLSTM)
+    kind = _StackedTuplePolicy if is_recurrent else _SeparatePolicies
+    return kind(actors, RandomStreams(random_states))
+
+
+class StackedPolicy(TensorDictModuleBase):
+    """A policy for each run, with random numbers of its own."""
+
+    runs: nn.ModuleList
+    """What each run's policy consists of; of parameters and buffers there is nothing else."""
+    streams: RandomStreams
+
+    @abstractmethod
+    def log_prob(self, steps: TensorDictBase) -> Tensor:
+        """Log-probability ``[N, T]`` of the actions of trajectories."""
+
+    def copy_run(self, run: int, other: StackedPolicy) -> None:
+        """Take over the weights that another stack has for a run."""
+        self.runs[run].load_state_dict(other.runs[run].state_dict())
+
+    def _count_rows(self, tensordict: TensorDictBase) -> list[int]:
+        """How many rows each run has.
+
+        Raises:
+            ValueError: if the rows do not come run after run.
+        """
+        runs = tensordict.get("run").flatten()
+        if (runs.diff() < 0).any():
+            raise ValueError(f"The rows must come run after run, got 'run' = {runs.tolist()}.")
+        return runs.bincount(minlength=len(self.runs)).tolist()
+
+
+class RandomStreams(nn.Module):
+    """A random generator for each run; their states are part of the state dict."""
+
+    def __init__(self, states: Sequence[Tensor]) -> None:
+        super().__init__()
+        self.generators = [torch.Generator() for _ in states]
+        self.set_extra_state(torch.stack(list(states)))
+
+    def get_extra_state(self) -> Tensor:
+        """The states, uint8 ``[R, n]``."""
+        return torch.stack([generator.get_state() for generator in self.generators])
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Go on from there."""
+        for generator, own in zip(self.generators, state.cpu(), strict=True):
+            generator.set_state(own.clone())  # torch reads a view from its storage's beginning
+
+    def uniform(self, sizes: Sequence[int], like: Tensor) -> Tensor:
+        """Numbers in [0, 1) for logits ``[sum(sizes), width]``: `sizes` rows of each run."""
+        dtype = torch.promote_types(like.dtype, torch.float32)  # as TupleCategorical.sample
+        parts = zip(sizes, self.generators, strict=True)
+        draws = [torch.rand(n, like.shape[-1], generator=own, dtype=dtype) for n, own in parts]
+        return torch.cat(draws).view_as(like)
+
+    @contextmanager
+    def drawing_from(self, run: int) -> Iterator[None]:
+        """Within, what draws from torch's global generator draws from a run's."""
+        before = torch.get_rng_state()
+        torch.set_rng_state(self.generators[run].get_state())
+        try:
+            yield
+        finally:
+            self.generators[run].set_state(torch.get_rng_state())
+            torch.set_rng_state(before)
+
+
+class _SeparatePolicies(StackedPolicy):
+    """Evaluates the policy of each run on its rows: the bandit's, of which there is one row."""
+
+    def __init__(self, actors: Sequence[Any], streams: RandomStreams) -> None:
+        super().__init__()
+        keys: list[Any] = ["run", "action", "action_log_prob"]
+        self.in_keys, self.out_keys = [*actors[0].in_keys, *keys[:1]], keys[1:]
+        self.runs, self.streams = nn.ModuleList(actors), streams
+
+    def _parts(self, tensordict: TensorDictBase) -> Iterator[tuple[Any, TensorDictBase]]:
+        parts: Any = tensordict.split(self._count_rows(tensordict))
+        return zip(self.runs, parts, strict=True)
+
+    def log_prob(self, steps: TensorDictBase) -> Tensor:
+        parts = self._parts(steps)
+        return torch.cat([actor.get_dist(part).log_prob(part["action"]) for actor, part in parts])
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write action and log-probability."""
+        acted = []
+        for run, (actor, part) in enumerate(self._parts(tensordict.reshape(-1))):
+            with self.streams.drawing_from(run):
+                acted.append(actor(part))
+        for key in self.out_keys:
+            value = torch.cat([part.get(key) for part in acted])
+            tensordict.set(key, value.view(tensordict.shape))
+        return tensordict
+
+
+class _StackedTuplePolicy(StackedPolicy):
+    """The recurrent tuple policy of each run, evaluated together."""
+
+    def __init__(self, actors: Sequence[Any], streams: RandomStreams) -> None:
+        super().__init__()
+        self.core = _StackedHistoryLSTM([actor.module[0] for actor in actors])
+        self.options = actors[0].module[1].distribution_kwargs
+        in_keys: list[Any] = self.core.in_keys
+        out_keys: list[Any] = [*self.core.out_keys, "action", "action_log_prob"]
+        self.in_keys, self.out_keys = in_keys, out_keys
+        self.streams = streams
+
+    @property
+    def runs(self) -> nn.ModuleList:
+        return self.core.cells
+
+    def get_dist(self, tensordict: TensorDictBase) -> TupleCategorical:
+        """The distribution of all rows; writes logits and states."""
+        return TupleCategorical(self.core(tensordict).get("logits"), **self.options)
+
+    def log_prob(self, steps: TensorDictBase) -> Tensor:
+        with set_recurrent_mode(True):
+            return self.get_dist(steps).log_prob(steps["action"])
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write logits, states, action and log-probability."""
+        distribution = self.get_dist(tensordict)
+        sizes = self._count_rows(tensordict)
+        action = distribution.choose(self.streams.uniform(sizes, distribution.logits))
+        tensordict.set("action", action)
+        return tensordict.set("action_log_prob", distribution.log_prob(action))
+
+
+class _StackedHistoryLSTM(DistinctHistoryLSTM):
+    """The LSTM and the readout of each run. A symbol says which run it belongs to."""
+
+    cells: Any
+    """Cell and readout of each run."""
+
+    def __init__(self, cores: Sequence[DistinctHistoryLSTM]) -> None:
+        first = cores[0]
+        super().__init__(
+            first.num_classes,
+            first.hidden_size,
+            in_keys=first.input_keys,
+            out_key=str(first.out_keys[0]),
+        )
+        del self.cell, self.readout
+        in_keys: list[Any] = [*self.in_keys, "run"]
+        self.in_keys = in_keys
+        # Not the cores: an environment would carry the states of each.
+        self.cells = nn.ModuleList(nn.ModuleList([core.cell, core.readout]) for core in cores)
+
+    def read_symbols(self, tensordict: TensorDictBase) -> Tensor:
+        return super().read_symbols(tensordict) + self.num_symbols * tensordict.get("run")
+
+    def find_histories(
+        self, symbols: Tensor, starts: Tensor, mask: Tensor | None, first_hashes: Tensor | None
+    ) -> Histories:
+        run, size = symbols // self.num_symbols, self.num_symbols
+        hashes = hash_histories(symbols % size, starts, num_symbols=size, first_hashes=first_hashes)
+        # Nodes are ordered by their hashes: now by run, and within a run as if it were alone.
+        run_first = (hashes >> BITS_OF_RUN) + (run << (64 - BITS_OF_RUN))
+        histories = distinct_histories(run_first, starts, mask)
+        num_steps, num_rows, num_runs = *symbols.shape, len(self.cells)
+        place = histories.rows // num_rows * num_runs + run.flatten()[histories.rows]
+        sizes = place.bincount(minlength=num_steps * num_runs).view(num_steps, -1).tolist()
+        return histories._replace(sizes=sizes)
+
+    def project(self, symbols: Tensor) -> Tensor:
+        run, own = symbols // self.num_symbols, symbols % self.num_symbols
+        parts = own.split(self._count(run))
+        return torch.cat(
+            [self.project_by(cell, part) for (cell, _), part in zip(self.cells, parts, strict=True)]
+        )
+
+    @property
+    def recurrent_weights(self) -> Sequence[Tensor]:
+        return [cell.weight_hh for cell, _ in self.cells]
+
+    def read_out(self, h: Tensor, symbols: Tensor) -> Tensor:
+        run = symbols // self.num_symbols
+        order = run.argsort(stable=True)
+        parts = h.index_select(0, order).split(self._count(run))
+        outputs = [readout(own) for (_, readout), own in zip(self.cells, parts, strict=True)]
+        return torch.cat(outputs).index_select(0, order.argsort())
+
+    def _count(self, runs: Tensor) -> list[int]:
+        """How many of each run there are."""
+        return runs.bincount(minlength=len(self.cells)).tolist()

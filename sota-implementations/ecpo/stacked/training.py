@@ -1,0 +1,203 @@
+"""Training all runs: Algorithm 1 as in ``ecpo.py``, with a loss, an optimiser and a record each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from copy import deepcopy
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from tasks import Metrics, Task, make_task
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torch.nn.utils import clip_grad_norm_
+from utils import make_loss, make_optimizer, make_run, make_temperatures, reached
+
+from stacked.envs import stack_envs
+from stacked.policies import stack_policies
+from torchrl_ecpo import TrajectoryGroupLoss
+from torchrl_ecpo.collectors import TrajectoryGroupCollector, shut_down
+from torchrl_ecpo.experiment import Checkpoints, Progress, Run
+from torchrl_ecpo.groups import MASK_KEY
+from torchrl_ecpo.schedules import TemperatureScheduler
+
+
+def train_stack(configs: Mapping[str, DictConfig], checkpoints: Checkpoints) -> None:
+    """Train the runs, by the name of their directory, together."""
+    stack = Stack(configs)
+    total = stack.members[0].config.total_trajectories
+    with shut_down(stack.collector), ExitStack() as open_runs:
+        for member in stack.members:
+            open_runs.enter_context(member.run)
+        run, *_ = (member.run for member in stack.members)
+        open_runs.enter_context(checkpoints.attach(run, stack.progress, **stack.parts()))
+        while stack.progress.trajectories < total:
+            stack.lift()
+            stack.project()
+            stack.anneal()
+            checkpoints.boundary()
+
+
+@dataclass
+class Member:
+    """What is a run's own."""
+
+    config: DictConfig
+    task: Task
+    loss_module: TrajectoryGroupLoss
+    optimizer: torch.optim.Optimizer
+    temperatures: TemperatureScheduler
+    run: Run
+    metrics: Metrics = field(default_factory=dict)
+    """Of the last project step."""
+
+
+class Stack:
+    """The runs, and what they share.
+
+    Args:
+        configs: of the runs, by the name of their directory.
+    """
+
+    def __init__(self, configs: Mapping[str, DictConfig]) -> None:
+        first, *_ = configs.values()
+        tasks, random_states = [], []
+        for config in configs.values():
+            torch.manual_seed(config.seed)
+            tasks.append(make_task(config))
+            random_states.append(torch.get_rng_state())
+        self.policy = stack_policies([task.actor for task in tasks], random_states)
+        self.reference = deepcopy(self.policy)  # runs lift at different times
+        self.collector = TrajectoryGroupCollector(
+            stack_envs([task.env for task in tasks]),
+            self.reference,
+            num_groups=len(tasks) * first.num_groups,
+            group_size=first.group_size,
+            exclude_keys=["logits"],
+        )
+        for config, task in zip(configs.values(), tasks, strict=True):
+            task.env.set_seed(config.seed)  # only now, for the collector has reset it
+        self._batches = iter(self.collector)
+        self._batch_size = first.num_groups * first.group_size
+        self.members = [
+            _make_member(Path(name), config, task, stack_size=len(tasks), show_bar=not index)
+            for index, ((name, config), task) in enumerate(zip(configs.items(), tasks, strict=True))
+        ]
+        is_annealing = [config.anneal_from is None for config in configs.values()]
+        self.progress = Progress(trajectories=0, project_steps=0, is_annealing=is_annealing)
+
+    def parts(self) -> dict[str, Any]:
+        """What a checkpoint holds beside the first run's record and the progress."""
+        parts: dict[str, Any] = {
+            "policy": self.policy,
+            "reference": self.reference,
+            "collector": self.collector,
+        }
+        for index, member in enumerate(self.members):
+            parts |= {
+                f"run_{index}": member.run,
+                f"optimizer_{index}": member.optimizer,
+                f"temperatures_{index}": member.temperatures,
+                f"evaluation_env_{index}": member.task.evaluation_env,
+            }
+        del parts["run_0"]
+        return parts
+
+    def lift(self) -> None:
+        """Where a run's projection begins, its current policy becomes its reference."""
+        lifted = [index for index, member in enumerate(self.members) if self._is_due(member)]
+        for index in lifted:
+            self.reference.copy_run(index, self.policy)
+        if lifted:
+            self.collector.update_policy_weights_()
+
+    def project(self) -> None:
+        """One gradient step of each run, on fresh trajectories of its reference."""
+        groups = next(self._batches)
+        all_losses = self._losses(groups)
+        for member in self.members:
+            member.optimizer.zero_grad()
+        torch.stack([losses["loss_actor"] for losses in all_losses]).sum().backward()
+        for member, losses in zip(self.members, all_losses, strict=True):
+            max_norm = member.config.optim.max_grad_norm or float("inf")
+            grad_norm = clip_grad_norm_(member.task.actor.parameters(), max_norm)
+            member.metrics = {**losses.detach(), "grad_norm": grad_norm}
+            self._check(member)
+        for member in self.members:
+            member.optimizer.step()
+
+        self.progress.trajectories += self._batch_size
+        self.progress.project_steps += 1
+        for member, part in zip(self.members, self._split(groups), strict=True):
+            member.metrics |= {**member.task.measure(part), **member.temperatures.values()}
+            if self.progress.project_steps % member.config.evaluation_interval == 0:
+                member.metrics |= member.task.evaluate(part)
+            member.run.log(member.metrics, step=self.progress.trajectories)
+
+    def anneal(self) -> None:
+        """Where a run's projection ends, its temperatures may fall."""
+        annealing = self.progress.is_annealing
+        for index, member in enumerate(self.members):
+            if self._is_due(member):
+                annealing[index] |= reached(member.config.anneal_from, member.metrics)
+                num_trajectories = member.config.project_steps * self._batch_size
+                member.temperatures.step(annealing[index] * num_trajectories)
+
+    def _is_due(self, member: Member) -> bool:
+        return self.progress.project_steps % member.config.project_steps == 0
+
+    def _losses(self, groups: TensorDictBase) -> list[Any]:
+        """Evaluate the policies once; each run's own loss makes of it what it would alone."""
+        steps = groups.select(*self.policy.in_keys, "action", MASK_KEY, strict=False).flatten(0, 1)
+        log_prob = self.policy.log_prob(steps).view(groups.shape)
+        parts = self._split(groups.copy().set("log_prob", log_prob))
+        return [own.loss_module(part) for own, part in zip(self.members, parts, strict=True)]
+
+    def _split(self, groups: TensorDictBase) -> list[TensorDictBase]:
+        """The batch of each run, without the padding that longer trajectories of others brought."""
+        parts: Any = groups.chunk(len(self.members))
+        return [part[..., : int(part[MASK_KEY].sum(-1).max())] for part in parts]
+
+    def _check(self, member: Member) -> None:
+        """Stop all runs before one is spoilt."""
+        try:
+            member.run.check(member.metrics, self.progress.trajectories)
+        except FloatingPointError as error:
+            raise FloatingPointError(f"{member.run.name}: {error}") from error
+
+
+def _make_member(directory: Path, config: DictConfig, task: Task, **options: Any) -> Member:
+    evaluated: Any = _Evaluated()
+    loss_module = make_loss(config.loss, evaluated)
+    directory.mkdir(exist_ok=True)
+    return Member(
+        config,
+        task,
+        loss_module,
+        make_optimizer(config.optim, task.actor.parameters()),
+        make_temperatures(config.loss, loss_module),
+        make_run(config, task, directory=directory, **options),
+    )
+
+
+class _Evaluated(TensorDictModuleBase):
+    """Stands for a policy whose log-probabilities have been evaluated: they are in the batch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        keys: list[Any] = ["log_prob"]
+        self.in_keys, self.out_keys = keys, keys[1:]
+
+    def get_dist(self, tensordict: TensorDictBase) -> _Evaluated:
+        """Keep what :meth:`log_prob` gives."""
+        self.value = tensordict.get("log_prob")
+        return self
+
+    def log_prob(self, action: Tensor) -> Tensor:
+        """Log-probability of the actions of the batch, whatever they are."""
+        return self.value
