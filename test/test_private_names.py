@@ -28,6 +28,7 @@ EXTENSION_POINTS = {
     "_schedulable_buffers",
     "_set_seed",
     "_step",
+    "_exit",  # os._exit
     # Of NamedTuple, whose public methods begin with an underscore.
     "_asdict",
     "_fields",
