@@ -1,4 +1,4 @@
-"""Time of `TrajectoryGroupSampler` for storages of 1e4 to 1e6 steps.
+"""Processor time of `TrajectoryGroupSampler` for storages of 1e4 to 1e6 steps.
 
 Run: python benchmarks/sampler.py
 """
@@ -42,9 +42,9 @@ def make_groups(first_group: int, num_steps: int) -> TensorDict:
 def milliseconds(run: Callable[[], object], repeats: int) -> float:
     times = []
     for _ in range(repeats):
-        start = time.perf_counter()
+        start = time.process_time()
         run()
-        times.append(time.perf_counter() - start)
+        times.append(time.process_time() - start)
     return 1e3 * median(times)
 
 
