@@ -108,6 +108,12 @@ def recurrent_policy():
     )
 
 
+def collect(env, policy=None, **options):
+    """A first batch, of two groups of three unless said otherwise."""
+    options = {"num_groups": 2, "group_size": 3, **options}
+    return next(iter(TrajectoryGroupCollector(env, policy, **options)))
+
+
 def check_batch(batch, num_groups, group_size, *, padded_with_zeros=True):
     mask = batch["collector", "mask"]
     length = mask.sum(-1)
@@ -165,22 +171,17 @@ def test_the_policy_sees_active_rows_only():
 
     env = Countdown(4, 5)
     policy = TensorDictModule(Watch(), ["observation"], ["action"])
-    collector = TrajectoryGroupCollector(env, policy, num_groups=4, group_size=5)
-    seen.clear()
-    batch = next(iter(collector))
+    batch = collect(env, policy, num_groups=4, group_size=5)
     assert seen == batch["collector", "mask"].sum((0, 1)).tolist()
     # The action of each step was made from the observation of that step.
     assert_close(batch["action"], batch["observation"][..., :1])
     assert_close(batch["next", "reward"], batch["action"])
-    collector.shutdown()
 
 
 def test_recurrent_policies_keep_their_state_while_rows_drop_out():
     policy = recurrent_policy()
-    collector = TrajectoryGroupCollector(
-        TransformedEnv(Countdown(3, 4), InitTracker()), policy, num_groups=6, group_size=4
-    )
-    batch = next(iter(collector))
+    env = TransformedEnv(Countdown(3, 4), InitTracker())
+    batch = collect(env, policy, num_groups=6, group_size=4)
     mask = batch["collector", "mask"]
     assert mask.sum(-1).unique().numel() > 3
     with torch.no_grad():
@@ -188,7 +189,6 @@ def test_recurrent_policies_keep_their_state_while_rows_drop_out():
         action = policy[1].module(features).view(*batch.shape, 1)
     assert_close(batch["action"][mask], action[mask])
     assert (batch["is_init"].squeeze(-1) == (torch.arange(batch.shape[-1]) == 0))[mask].all()
-    collector.shutdown()
 
 
 def test_recurrent_policies_need_no_transforms():
@@ -203,8 +203,7 @@ def test_recurrent_policies_need_no_transforms():
         patch.setattr(InitTracker, "_call", lambda *args: steps.append(None) or tracker_step(*args))
         for env in (transformed, plain):
             steps.clear()
-            collector = TrajectoryGroupCollector(env, policy, num_groups=6, group_size=4)
-            batches.append(next(iter(collector)).exclude("group"))
+            batches.append(collect(env, policy, num_groups=6, group_size=4).exclude("group"))
             assert bool(steps) == (env is transformed)
     assert_td_close(*batches)
     first = torch.arange(batches[1].shape[-1]) == 0
@@ -219,8 +218,7 @@ def count_steps(data):
 
 
 def test_policies_may_keep_entries_of_their_own():
-    collector = TrajectoryGroupCollector(Countdown(3, 4), count_steps, num_groups=6, group_size=4)
-    batch = next(iter(collector))
+    batch = collect(Countdown(3, 4), count_steps, num_groups=6, group_size=4)
     check_batch(batch, 6, 4)
     mask = batch["collector", "mask"]
     time = torch.arange(batch.shape[-1]).expand(mask.shape)
@@ -232,7 +230,7 @@ def test_policies_may_keep_entries_of_their_own():
 def test_what_a_policy_overwrites_is_what_it_acted_on():
     double = TensorDictModule(lambda x: 2 * x, ["observation"], ["observation"])
     policy = TensorDictSequential(double, linear_policy(1.0))
-    batch = next(iter(TrajectoryGroupCollector(Countdown(), policy, num_groups=2, group_size=3)))
+    batch = collect(Countdown(), policy)
     mask = batch["collector", "mask"]
     assert (batch["observation"][..., 0] == 2 * batch["left"][..., 0])[mask].all()
     assert (batch["action"] == 2.0)[mask].all()
@@ -245,23 +243,18 @@ def test_transforms_and_states_in_the_tensordict_follow_the_right_rows(declared)
         env.state_spec = Composite(left=env.observation_spec["left"].clone(), shape=(3, 4))
     env = TransformedEnv(env, StepCounter())
     env.append_transform(RewardSum())
-    collector = TrajectoryGroupCollector(
-        env, linear_policy(2.0), num_groups=3, group_size=4, compact_obs=False
-    )
-    batch = next(iter(collector))
+    batch = collect(env, linear_policy(2.0), num_groups=3, group_size=4, compact_obs=False)
     mask = batch["collector", "mask"]
     time = torch.arange(batch.shape[-1]).expand(mask.shape)
     assert (batch["step_count"].squeeze(-1) == time)[mask].all()
     assert (batch["next", "episode_reward"].squeeze(-1) == 2 * (time + 1))[mask].all()
     assert (batch["next", "left"] == batch["left"] - 1)[mask].all()
-    collector.shutdown()
 
 
 def test_what_a_batch_keeps():
     env = TransformedEnv(Countdown(), InitTracker())
-    options = {"num_groups": 2, "group_size": 3}
     batches = [
-        next(iter(TrajectoryGroupCollector(env, recurrent_policy(), **options, **more)))
+        collect(env, recurrent_policy(), **more)
         for more in ({}, {"compact_obs": False, "exclude_keys": ["features", ("next", "left")]})
     ]
     shared = {"observation", "left", "action", "is_init", "group", "done", "terminated"}
@@ -282,10 +275,8 @@ def test_what_is_private_is_left_out():
     hide = TensorDictModule(lambda x: x, ["observation"], ["_seen"])
     policy = TensorDictSequential(hide, linear_policy())
     for compact_obs in (True, False):
-        collector = TrajectoryGroupCollector(
-            Hiding(), policy, num_groups=2, group_size=3, compact_obs=compact_obs
-        )
-        keys = [key if isinstance(key, tuple) else (key,) for key in collector.rollout().keys(True)]
+        batch = collect(Hiding(), policy, compact_obs=compact_obs)
+        keys = [key if isinstance(key, tuple) else (key,) for key in batch.keys(True)]
         assert ("observation",) in keys
         assert not [key for key in keys if any(part.startswith("_") for part in key)]
 
@@ -305,12 +296,10 @@ def nested_policy(read):
 @pytest.mark.parametrize("read", ["agents", ("agents", "features")], ids=str)
 def test_nested_entries_are_read_and_left_out_by_what_they_are_nested_in(read):
     env = TransformedEnv(Countdown(), RenameTransform(["observation"], [("agents", "features")]))
-    options = {"num_groups": 2, "group_size": 3, "exclude_keys": ["params"]}
-    batch = next(iter(TrajectoryGroupCollector(env, nested_policy(read), **options)))
+    batch = collect(env, nested_policy(read), exclude_keys=["params"])
     assert ("agents", "features") in batch.keys(True)
     assert not any("params" in key for key in batch.keys(True, True))
-    options["exclude_keys"] = ["agents"]
-    batch = next(iter(TrajectoryGroupCollector(env, nested_policy(read), **options)))
+    batch = collect(env, nested_policy(read), exclude_keys=["agents"])
     assert ("params", "loc") in batch.keys(True)
     assert not any("agents" in key for key in batch.keys(True, True))
 
@@ -321,7 +310,7 @@ def test_entries_that_are_no_tensors_are_refused():
     spec["prompt"] = NonTensor(shape=env.batch_size)
     env.observation_spec = spec
     with pytest.raises(TypeError, match=r"Only tensors .*'prompt'.*ExcludeTransform"):
-        TrajectoryGroupCollector(env, linear_policy(1.0), num_groups=2, group_size=3)
+        collect(env)
 
 
 def test_a_batch_is_sampled_from_the_reference():
@@ -457,32 +446,28 @@ def test_state_dict_resumes_to_the_bit():
     assert batch["collector", "traj_ids"].max() > last["collector", "traj_ids"].max()
 
 
-def test_writes_to_a_replay_buffer():
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(500),
-        sampler=TrajectoryGroupSampler(group_size=3, replacement=False),
-        batch_size=6,
-    )
+@pytest.mark.parametrize("make", [Countdown(), [Countdown, Countdown]], ids=["here", "workers"])
+def test_random_actions_are_written_to_a_replay_buffer(make):
+    sampler = TrajectoryGroupSampler(group_size=3, replacement=False)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(500), sampler=sampler, batch_size=6)
     collector = TrajectoryGroupCollector(
-        Countdown(),
-        linear_policy(),
-        num_groups=4,
-        group_size=3,
-        replay_buffer=buffer,
-        total_frames=90,
+        make, num_groups=4, group_size=3, replay_buffer=buffer, total_frames=90
     )
     written = 0
-    for nothing in collector:
-        assert nothing is None
-        written += 12
-        steps = buffer[:]
-        assert ("collector", "mask") not in steps.keys(True)
-        groups = pack_groups(steps, group_size=3)
-        assert groups.shape[:2].numel() == written
-        check_batch(groups, written // 3, 3)
-        assert_td_close(unpack_groups(groups), steps)
-        check_batch(buffer.sample(), 2, 3, padded_with_zeros=False)
+    with shut_down(collector):
+        for nothing in collector:
+            assert nothing is None
+            written += 12
+            steps = buffer[:]
+            assert ("collector", "mask") not in steps.keys(True)
+            groups = pack_groups(steps, group_size=3)
+            assert groups.shape[:2].numel() == written
+            check_batch(groups, written // 3, 3)
+            assert_td_close(unpack_groups(groups), steps)
+            check_batch(buffer.sample(), 2, 3, padded_with_zeros=False)
     assert len(buffer) >= 90
+    # Workers draw from streams of their own.
+    assert len(groups["action"][:, 0, 0].unique()) == len(groups)
 
 
 class Stranger(Countdown):
@@ -537,18 +522,12 @@ def test_bad_arguments(options, error, match):
     ],
 )
 def test_bad_environments(env, error, match):
-    collector = TrajectoryGroupCollector(
-        env(), linear_policy(), num_groups=20, group_size=3, max_steps=20
-    )
     with pytest.raises(error, match=match):
-        next(iter(collector))
+        collect(env(), num_groups=20, max_steps=20)
 
 
 def test_max_frames_per_traj():
-    collector = TrajectoryGroupCollector(
-        Countdown(shortest=9, longest=50), num_groups=2, group_size=3, max_frames_per_traj=5
-    )
-    batch = next(iter(collector))
+    batch = collect(Countdown(shortest=9, longest=50), max_frames_per_traj=5)
     assert batch.shape[-1] == 5
     assert batch["collector", "mask"].all()
     assert batch["next", "truncated"][..., -1, 0].all()
@@ -605,28 +584,6 @@ def test_an_error_in_a_worker_process_is_raised_here():
     collector = TrajectoryGroupCollector(make, num_groups=2, group_size=3, num_collectors=1)
     with shut_down(collector), pytest.raises(ZeroDivisionError, match="in the rules"):
         next(iter(collector))
-
-
-def test_workers_act_at_random_and_write_to_a_replay_buffer():
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(1000),
-        sampler=TrajectoryGroupSampler(group_size=3),
-        batch_size=6,
-    )
-    collector = TrajectoryGroupCollector(
-        [Countdown, Countdown], num_groups=4, group_size=3, total_frames=80, replay_buffer=buffer
-    )
-    with shut_down(collector):
-        for i, nothing in enumerate(collector, start=1):
-            assert nothing is None
-            groups = pack_groups(buffer[:], group_size=3)
-            assert groups.shape[0] == 4 * i
-            sample = buffer.sample()
-            check_batch(sample, 2, 3, padded_with_zeros=False)
-            assert ("next", "observation") not in sample.keys(True)
-    assert 80 <= len(buffer) < 160
-    first = [groups["action"][group, 0, 0].item() for group in (0, 4)]
-    assert first[0] != first[1]  # workers draw from streams of their own
 
 
 def test_ray_workers():
