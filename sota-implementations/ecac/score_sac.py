@@ -24,7 +24,8 @@ class ScoreSACLoss(SACLoss):
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss of the policy, and the log-probabilities by which alpha is learned."""
-        critics: Any = self._vmap_qnetworkN0
+        critic: Any = self.qvalue_network
+        log_alpha: Any = self.log_alpha
         value_network: Any = self.value_network
         value_params: Any = self.value_network_params
         state = tensordict.select(*self.actor_network.in_keys)
@@ -36,14 +37,9 @@ class ScoreSACLoss(SACLoss):
             action, log_prob = distribution.sample_and_log_prob()
         with torch.no_grad():
             state.set(self.tensor_keys.action, action)
-            qvalues = critics(state, self.qvalue_network_params)
+            qvalues = critic.each(state, self.qvalue_network_params)
             qvalue = qvalues.get(self.tensor_keys.state_action_value).min(0)[0].squeeze(-1)
             with value_params.to_module(value_network, preserve_module_state=False):
                 value = value_network(state).get(self.tensor_keys.value).squeeze(-1)
-            signal = self._alpha * log_prob - qvalue + value
-        loss = self._reduce_loss(
-            log_prob * signal,
-            tensordict=tensordict,
-            weights=self._maybe_get_priority_weight(tensordict),
-        )
-        return loss, {"log_prob": log_prob.detach()}
+            signal = log_alpha.exp() * log_prob - qvalue + value
+        return (log_prob * signal).mean(), {"log_prob": log_prob.detach()}

@@ -21,11 +21,11 @@ from tensordict.nn import (
     dispatch,
 )
 from torch import Tensor, nn
-from torch.autograd import Function
-from torch.library import custom_op
 from torch.nn.functional import linear
 from torchrl.data import Bounded, TensorSpec
 from torchrl.modules import ProbabilisticActor, TanhModule, TanhNormal
+
+from torchrl_ecpo._torch import is_transformed
 
 __all__ = [
     "DenseNetwork",
@@ -38,16 +38,14 @@ __all__ = [
 HIDDEN_SIZES = (256, 256)
 LOG_SCALE_BOUNDS = (-5.0, 2.0)
 NARROW = 32
-"""Matrices with no more rows or columns are multiplied fastest without further ado."""
+"""So many numbers are multiplied as fast for each sample as once."""
 
 
 class DenseNetwork(TensorDictModuleBase):
     """A multi-layer perceptron with ReLU, from entries of a TensorDict to entries of it.
 
-    It computes what ``TensorDictModule(MLP(...))`` does. The update of an actor-critic calls its
-    networks eight times on small batches and swaps their parameters each time, so what surrounds
-    the matrix products counts: here all parameters belong to one module, outputs are written as
-    they are, and :meth:`each` calls several Q networks without swapping anything.
+    It computes what ``TensorDictModule(MLP(...))`` does, and :meth:`each` with several sets of
+    parameters at once.
 
     Args:
         in_keys: entries to read, ``[..., n]`` each; they are concatenated.
@@ -107,18 +105,18 @@ class DenseNetwork(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the outputs into ``tensordict``."""
         parameters = [getattr(self, name) for name in self._names]
-        return self._write(self._compute(self._read(tensordict), parameters), tensordict)
+        inputs = torch.cat([tensordict.get(key) for key in self.in_keys], -1)
+        return self._write(_compute([inputs], parameters), tensordict)
 
     def each(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
         """The outputs with each of N sets of parameters, on the same inputs.
 
-        It stands for ``torch.vmap`` over the parameters, and for TorchRL's loop that replaces it,
-        in the losses that have several Q networks. On a CPU it is faster than either: parameters
-        are not swapped in and out of the module, and nothing but the outputs is stacked.
-
-        Where entries of more than 32 numbers are repeated along the first dimension by ``expand``,
-        beside others that are not, as states are that have several actions each, the first layer
-        multiplies them once.
+        It stands for ``torch.vmap`` over the parameters in a loss that has several Q networks, and
+        is faster on a CPU: parameters are not swapped in and out of the module, and nothing but the
+        outputs is stacked. Where entries of more than 32 numbers are repeated along the first
+        dimension by ``expand``, as states are that have several actions each, the first layer
+        multiplies them once. An update of ECAC takes 6 % less than with a loop over the networks
+        where observations have 17 numbers, 33 % less where they have 348.
 
         Args:
             tensordict: with the entries to read; left as it is.
@@ -135,37 +133,20 @@ class DenseNetwork(TensorDictModuleBase):
             >>> network.each(TensorDict(observation=torch.zeros(5, 3)), twice)["state_value"].shape
             torch.Size([2, 5, 1])
         """
-        inputs = self._read(tensordict)
+        inputs = [tensordict.get(key) for key in self.in_keys]
+        repeated = [_is_repeated(x) for x in inputs]
+        is_uniform = len({(x.shape[:-1], x.dtype) for x in inputs}) == 1
+        if is_uniform and any(repeated) and not all(repeated):
+            inputs = [x[:1] if once else x for x, once in zip(inputs, repeated, strict=True)]
+        else:
+            inputs = [torch.cat(inputs, -1)]
         sets = zip(*(params.get(name).unbind(0) for name in self._names), strict=True)
-        outputs = [self._compute(inputs, parameters) for parameters in sets]
+        outputs = [_compute(inputs, parameters) for parameters in sets]
         return self._write(torch.stack(outputs), TensorDict())
 
     def _layers(self) -> Iterator[tuple[str, str, int, int]]:
         """Names of weight and bias of each layer, and its numbers of inputs and outputs."""
         return zip(self._names[::2], self._names[1::2], self.sizes, self.sizes[1:], strict=False)
-
-    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
-        """The inputs side by side; if some are repeated beside others that are not, each alone.
-
-        Of those that are repeated the first, ``[1, ...]``.
-        """
-        inputs = [tensordict.get(key) for key in self.in_keys]
-        if len(inputs) == 1:
-            return inputs
-        if len({(x.shape[:-1], x.dtype) for x in inputs}) == 1:
-            repeated = [_is_repeated(x) for x in inputs]
-            if any(repeated) and not all(repeated):
-                return [x[:1] if once else x for x, once in zip(inputs, repeated, strict=True)]
-        return [torch.cat(inputs, -1)]
-
-    @staticmethod
-    def _compute(inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:
-        (weight, bias), *others = zip(parameters[::2], parameters[1::2], strict=True)
-        x = _first_layer(inputs, weight, bias)
-        for weight, bias in others:
-            x = _product(x.relu_(), weight, bias)  # what goes into ReLU is read by nobody else
-        batch_shape = torch.broadcast_shapes(*(each.shape[:-1] for each in inputs))
-        return x.unflatten(0, batch_shape) if len(batch_shape) > 1 else x
 
     def _write(self, output: Tensor, tensordict: TensorDictBase) -> TensorDictBase:
         outputs = (output,) if self.head is None else self.head(output)
@@ -174,18 +155,20 @@ class DenseNetwork(TensorDictModuleBase):
         return tensordict
 
 
-def _first_layer(inputs: Sequence[Tensor], weight: Tensor, bias: Tensor) -> Tensor:
-    """The product of a layer with inputs side by side, in rows; of ``[1, ...]``, for all rows."""
+def _compute(inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:
+    """Of inputs side by side; the first layer multiplies once what is ``[1, ...]``."""
+    (weight, bias), *others = zip(parameters[::2], parameters[1::2], strict=True)
     if len(inputs) == 1:
-        return _product(_in_rows(inputs[0]), weight, bias)
-    shared, own = bias, []
-    for x, columns in zip(inputs, weight.split([x.shape[-1] for x in inputs], -1), strict=True):
-        product = _product(_in_rows(x), columns, None).unflatten(0, (len(x), -1))
-        if len(x) == 1:
-            shared = shared + product
-        else:
-            own.append(product)
-    return sum(own[1:], own[0]).add_(shared).flatten(0, 1)
+        x = linear(inputs[0], weight, bias)
+    else:
+        blocks = weight.split([x.shape[-1] for x in inputs], -1)
+        products = [linear(x, block) for x, block in zip(inputs, blocks, strict=True)]
+        shared = sum((x for x in products if len(x) == 1), bias)
+        own = [x for x in products if len(x) > 1]
+        x = sum(own[1:], own[0]).add_(shared)
+    for weight, bias in others:
+        x = linear(x.relu_(), weight, bias)  # what goes into ReLU is read by nobody else
+    return x
 
 
 def _is_repeated(x: Tensor) -> bool:
@@ -193,88 +176,9 @@ def _is_repeated(x: Tensor) -> bool:
 
     If it has a gradient, that is one of each copy.
     """
-    return (
-        x.dim() > 2
-        and x.shape[0] > 1
-        and x.stride(0) == 0
-        and x.shape[-1] > NARROW
-        and not x.requires_grad
-        and not torch._C._are_functorch_transforms_active()
-    )
-
-
-def _in_rows(x: Tensor) -> Tensor:
-    return x.flatten(0, -2) if x.dim() > 2 else x
-
-
-def _product(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-    """``torch.nn.functional.linear``, by oneDNN where it can be and is worth it."""
-    if not _is_fast(x, weight):
-        return linear(x, weight, bias)
-    # In the backward pass x stands where the weight does.
-    return _fast_linear(_dense(x), _dense(weight), bias)
-
-
-class _OneDNNLinear(Function):
-    """``torch.nn.functional.linear`` of matrices, by oneDNN.
-
-    PyTorch multiplies matrices in single precision by MKL. On some AMD EPYC, oneDNN takes half the
-    time for layers of 256 units and batches of 256. Results differ by rounding.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-        ctx.save_for_backward(x, weight)
-        return (_opaque if torch.compiler.is_compiling() else _onednn)(x, weight, bias)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        (gradient,), (x, weight) = gradients, ctx.saved_tensors
-        of_x, of_weight, of_bias = ctx.needs_input_grad
-        return (
-            _product(gradient, weight.t(), None) if of_x else None,
-            _product(gradient.t(), x.t(), None) if of_weight else None,
-            gradient.sum(0) if of_bias else None,
-        )
-
-
-def _dense(matrix: Tensor) -> Tensor:
-    """Without gaps between rows or columns: with them oneDNN takes a thousand times as long."""
-    is_dense = matrix.is_contiguous() or matrix.t().is_contiguous()
-    return matrix if is_dense else matrix.contiguous()
-
-
-def _onednn(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-    return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "none", [], "")
-
-
-# The compiler, which has a form of its own for that operator, takes it for constant weights only.
-_opaque = custom_op("torchrl_ecpo::linear", _onednn, mutates_args=())
-_opaque.register_fake(lambda x, weight, bias: x.new_empty(x.shape[0], weight.shape[0]))
-
-_fast_linear: Callable[..., Tensor] = _OneDNNLinear.apply
-# The operator is PyTorch's own, but not a public one.
-_HAS_ONEDNN = torch.backends.mkldnn.is_available() and hasattr(
-    torch.ops.mkldnn, "_linear_pointwise"
-)
-
-
-def _is_fast(x: Tensor, weight: Tensor) -> bool:
-    """Whether :class:`_OneDNNLinear` can stand for ``linear``: on floats of a CPU, untransformed.
-
-    It takes longer for few rows, inputs or outputs, as the last layer has them.
-    """
-    return (
-        _HAS_ONEDNN
-        and torch.backends.mkldnn.enabled
-        and x.dim() == 2
-        and min(*x.shape, weight.shape[0]) > NARROW
-        and x.shape[1] == weight.shape[1]  # if not, let `linear` say so
-        and x.dtype == weight.dtype == torch.float32
-        and x.device.type == "cpu"
-        and not torch.is_autocast_enabled("cpu")
-        and not torch._C._are_functorch_transforms_active()
-    )
+    is_expanded = x.dim() > 2 and x.shape[0] > 1 and x.stride(0) == 0
+    is_worth_it = is_expanded and x.shape[-1] > NARROW
+    return is_worth_it and not x.requires_grad and not is_transformed()
 
 
 def _loc_and_scale(
