@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import ast
+import math
 import re
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from actor_critic_problems import become, call, make_batch, make_networks
+from actor_critic_problems import gradients as gradients_by_name
+from torch.distributions import Normal
 from torch.testing import assert_close
 from torchrl.objectives import HardUpdate
 from trajectory_problems import MASK, gradients, make_actor, move, pad, sample, split
 
-from torchrl_ecpo import TemperatureScheduler, TrajectoryGroupLoss
+from torchrl_ecpo import PolyakAverage, TemperatureScheduler, TrajectoryGroupLoss
 from torchrl_ecpo.functional import Surrogate
 from torchrl_ecpo.schedules import linear
 
@@ -31,10 +36,10 @@ def member(name: str) -> Any:
     raise AssertionError(f"{PAGE.name} has no {name}")
 
 
-GRPOLoss, REPSLoss = member("GRPOLoss"), member("REPSLoss")
+GRPOLoss, REPSLoss, MPOLoss = member("GRPOLoss"), member("REPSLoss"), member("MPOLoss")
 
 
-@pytest.mark.parametrize(("name", "most"), [("GRPOLoss", 20), ("REPSLoss", 15)])
+@pytest.mark.parametrize(("name", "most"), [("GRPOLoss", 20), ("REPSLoss", 15), ("MPOLoss", 40)])
 def test_a_member_is_short(name, most):
     [block] = [block for block in BLOCKS if f"class {name}" in block]
     [node] = [n for n in ast.parse(block).body if isinstance(n, ast.ClassDef)]
@@ -329,3 +334,46 @@ def test_steps_are_what_is_summed(padded):
     assert_close(groups.num_steps, mask.sum(-1).double())
     assert steps.log_prob.requires_grad
     assert not steps.reference_log_prob.requires_grad
+
+
+# --------------------------------------------------------------------------------------------- MPO
+
+
+def test_mpo_in_plain_numbers():
+    """Its five numbers at each state, and what each reaches."""
+    new, old = make_networks("normal", seed=2), make_networks("normal", seed=1)
+    loss = MPOLoss(deepcopy(old.actor), deepcopy(old.qvalues), reduction="none").double()
+    PolyakAverage(loss)
+    become(loss, new)
+    loss.log_tau.data.fill_(math.log(0.5))
+    loss.log_alpha_mean.data.fill_(math.log(3.0))
+    batch = make_batch("normal")
+    out = call(loss, batch)
+    lift = call_lift(loss, batch)
+    weights = (lift.score / 0.5).softmax(0)
+    (loc, scale), (old_loc, old_scale) = (
+        [network.actor[0](batch.select("observation"))[key] for key in ("loc", "scale")]
+        for network in (new, old)
+    )
+    of_mean = (0.5 * ((loc - old_loc) / old_scale) ** 2).sum(-1)
+    ratio = old_scale / scale
+    of_scale = (0.5 * ratio**2 - 0.5 - ratio.log()).sum(-1)
+    assert_close((out["kl_mean"], out["kl_scale"]), (of_mean.detach(), of_scale.detach()))
+    fits = [Normal(loc, old_scale), Normal(old_loc, scale)]
+    fit = sum((weights * f.log_prob(lift.actions.latent).sum(-1)).sum(0) for f in fits)
+    assert_close(out["loss_actor"], -fit + 3.0 * of_mean + 1.0 * of_scale)
+    assert_close(out["state_value"], lift.score.mean(0))
+    divergence = out["kl_target_reference"].mean()
+    gradient = gradients_by_name(loss, out["loss_tau"].mean())["log_tau"]
+    assert_close(gradient, 0.5 * (0.1 - divergence))  # of tau: epsilon - KL
+    gradient = gradients_by_name(loss, out["loss_alpha_mean"].mean())["log_alpha_mean"]
+    assert_close(gradient, -(of_mean.detach() / 0.01 - 1).mean())
+    loss.select_out_keys("loss_tau", "kl_scale")
+    assert list(call(loss, batch).keys()) == ["loss_tau", "kl_scale"]
+
+
+def call_lift(loss, batch):
+    """That of a call: the action of the next state was drawn before it."""
+    torch.manual_seed(0)
+    loss.states(batch["next"].clone()).reference.rsample((1,))
+    return loss.states(batch).lift
