@@ -35,10 +35,7 @@ EXTENSION_POINTS = {
     "_replace",
 }
 STILL_TO_CLEAN = {
-    "sota-implementations/ecac/score_sac.py",
     "sota-implementations/ecac/utils.py",
-    "torchrl_ecpo/modules/actor_critic.py",
-    "torchrl_ecpo/objectives/actor_critic.py",
 }
 
 

@@ -5,8 +5,6 @@ from torchrl_ecpo.envs import BanditEnv
 from torchrl_ecpo.modules import make_softmax_policy
 from torchrl_ecpo.objectives import (
     ActorCriticLoss,
-    ContinuousActorCriticLoss,
-    DiscreteActorCriticLoss,
     DiscreteECACLoss,
     DiscretePMDACLoss,
     ECACLoss,
@@ -26,8 +24,6 @@ from torchrl_ecpo.updaters import PeriodicCopy, PolyakAverage, UpdaterSequence
 __all__ = [
     "ActorCriticLoss",
     "BanditEnv",
-    "ContinuousActorCriticLoss",
-    "DiscreteActorCriticLoss",
     "DiscreteECACLoss",
     "DiscretePMDACLoss",
     "ECACLoss",

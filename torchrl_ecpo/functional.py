@@ -52,6 +52,7 @@ __all__ = [
     "effective_sample_size",
     "lift_divergence_estimate",
     "lifted_log_weights",
+    "log_mean_exp",
     "masked_mean",
     "mean_seeking_projection",
     "ment_surrogate",
@@ -605,8 +606,7 @@ def soft_value_estimate(
         tensor(1.5000)
     """
     log_weights = lifted_log_weights(score, reference_log_prob, tau=tau, tau_prime=tau_prime)
-    log_uniform = _log_uniform(log_weights, sample_dim, mask)
-    return (tau + tau_prime) * _masked_logsumexp(log_weights + log_uniform, sample_dim, mask)
+    return (tau + tau_prime) * log_mean_exp(log_weights, sample_dim=sample_dim, mask=mask)
 
 
 def surrogate_reward(
@@ -860,6 +860,24 @@ def score_function_loss(
     """
     uniform = uniform_weights(log_prob, sample_dim=sample_dim, mask=mask)
     return -weighted_sum(uniform * advantage.detach(), log_prob, sample_dim=sample_dim, mask=mask)
+
+
+def log_mean_exp(values: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None) -> Tensor:
+    """Logarithm of the mean of exp(values) over the real samples.
+
+    Args:
+        values: ``[E*, K]``.
+
+    Returns:
+        ``[E*]``.
+
+    Examples:
+        log((1 + 3) / 2) = log 2:
+
+        >>> log_mean_exp(torch.tensor([1.0, 3.0]).log()).exp()
+        tensor(2.)
+    """
+    return _masked_logsumexp(values + _log_uniform(values, sample_dim, mask), sample_dim, mask)
 
 
 def _log_uniform(like: Tensor, dim: int, mask: Tensor | None) -> Tensor | float:

@@ -151,7 +151,15 @@ CASES = {
 }
 CONTINUOUS = ("ecac", "pmd_ac")
 
-METRICS = ["ESS", "kl_target", "kl_to_reference", "entropy", "saturation", "qvalue", "state_value"]
+METRICS = [
+    "ESS",
+    "kl_target_reference",
+    "kl_reference_policy",
+    "entropy",
+    "saturation",
+    "qvalue",
+    "state_value",
+]
 
 
 def out_keys(case: Case, *, value: bool, learned: bool = False) -> list[str]:
@@ -385,15 +393,15 @@ def expected_outputs(
         probability = lifted.reference.exp()
         log_prob = probabilities(new.actor, state).log().detach()
         outputs |= {
-            "kl_target": (weights * (weights.log() - lifted.reference)).sum(0),
-            "kl_to_reference": (probability * (lifted.reference - log_prob)).sum(0),
+            "kl_target_reference": (weights * (weights.log() - lifted.reference)).sum(0),
+            "kl_reference_policy": (probability * (lifted.reference - log_prob)).sum(0),
             "entropy": -(probability * lifted.reference).sum(0),
         }
     else:
         log_prob = gaussian_log_prob(new.actor, state, lifted.latent).detach()
         outputs |= {
-            "kl_target": (weights * (weights * len(weights)).log()).sum(0),
-            "kl_to_reference": (lifted.reference - log_prob).mean(0),
+            "kl_target_reference": (weights * (weights * len(weights)).log()).sum(0),
+            "kl_reference_policy": (lifted.reference - log_prob).mean(0),
             "entropy": -lifted.reference.mean(0),
             "saturation": (lifted.latent.tanh().abs() > 0.95)
             .to(batch["observation"].dtype)

@@ -24,10 +24,9 @@ from torchrl.modules import IndependentNormal, MaskedCategorical, TanhNormal, Tr
 from torchrl.modules import OneHotCategorical as TorchRLOneHotCategorical
 
 from torchrl_ecpo.objectives.actions import (
+    SampledActions,
     gaussian_parameters,
     is_discrete,
-    log_prob_of,
-    sample_actions,
 )
 
 LOC = torch.tensor([[0.3, -1.0], [0.0, 2.0], [-0.5, 0.1]], dtype=torch.float64)
@@ -58,10 +57,10 @@ def test_samples_are_those_of_the_policy(kind, dtype):
     """Shapes, and the same log-probability as by inverting the transform."""
     policy = GAUSSIAN[kind](LOC.to(dtype), SCALE.to(dtype))
     torch.manual_seed(0)
-    actions = sample_actions(policy, 5)
+    actions = SampledActions.of(policy, 5)
     assert actions.action.shape == actions.latent.shape == (5, 3, 2)
     assert actions.log_prob.shape == (5, 3)
-    assert {x.dtype for x in actions[:3]} == {dtype}
+    assert {x.dtype for x in (actions.log_prob, actions.action, actions.latent)} == {dtype}
     tolerance = {"rtol": 1e-3, "atol": 1e-3} if dtype == torch.float32 else {}
     assert_close(actions.log_prob, policy.log_prob(actions.action), **tolerance)
     torch.manual_seed(0)
@@ -79,17 +78,17 @@ def test_samples_are_those_of_the_policy(kind, dtype):
 @gaussian
 def test_log_prob_under_another_policy(kind):
     """Of the same transform: its log-volume is that of the samples."""
-    actions = sample_actions(GAUSSIAN[kind](LOC, SCALE), 5)
+    actions = SampledActions.of(GAUSSIAN[kind](LOC, SCALE), 5)
     other = GAUSSIAN[kind](LOC + 0.3, SCALE * 1.2)
-    assert_close(log_prob_of(actions, other), other.log_prob(actions.action))
+    assert_close(actions.log_prob_of(other), other.log_prob(actions.action))
 
 
 @gaussian
 def test_samples_carry_the_gradient(kind):
     """Of actions, latents and log-probabilities, with respect to both parameters."""
     loc, scale = LOC.clone().requires_grad_(), SCALE.clone().requires_grad_()
-    actions = sample_actions(GAUSSIAN[kind](loc, scale), 5)
-    for output in actions[:2]:
+    actions = SampledActions.of(GAUSSIAN[kind](loc, scale), 5)
+    for output in (actions.action, actions.log_prob):
         for gradient in torch.autograd.grad(output.sum(), (loc, scale), retain_graph=True):
             assert gradient.isfinite().all()
     # A translation moves every sample alike, and the density of a latent not at all.
@@ -102,7 +101,7 @@ def test_saturated_actions_are_never_inverted(kind, dtype):
     """tanh(30) is 1: its inverse is not 30, but the log-probability is that of 30."""
     loc = torch.full((1, 2), 30.0, dtype=dtype)
     policy = GAUSSIAN[kind](loc, torch.full_like(loc, 1e-3))
-    actions = sample_actions(policy, 4)
+    actions = SampledActions.of(policy, 4)
     stretch = math.log(2.5) if kind == "bounded" else 0.0
     normal = Normal(loc, 1e-3).log_prob(actions.latent)
     expected = normal - (math.log(4) - 2 * actions.latent) - stretch
@@ -128,9 +127,9 @@ OTHERS = {
 def test_policies_that_are_no_diagonal_gaussians(name):
     """They can be sampled, not centred; the message says what to do."""
     policy = OTHERS[name]
-    actions = sample_actions(policy, 5)
+    actions = SampledActions.of(policy, 5)
     assert_close(actions.log_prob, policy.log_prob(actions.action))
-    assert_close(log_prob_of(actions, policy), actions.log_prob)
+    assert_close(actions.log_prob_of(policy), actions.log_prob)
     kind = type(policy).__name__
     message = f'projection="centred" needs a diagonal Gaussian.*got {kind}.*Use projection="paper"'
     with pytest.raises(ValueError, match=message):

@@ -83,7 +83,7 @@ def states(*shape: int) -> TensorDict:
 
 def lifted(loss, batch, m: int, seed: int = 0):
     torch.manual_seed(seed)
-    policy = loss._distribution(batch, loss.actor_network_params)
+    policy = loss.states(batch).policy
     return loss.lift(batch, policy, loss.qvalue_network_params, m)
 
 
@@ -118,7 +118,7 @@ def test_lift_of_a_gaussian_by_a_quadratic_is_that_gaussian(name, tau, tau_prime
     )
     target, value = _target(name, tau, tau_prime)
     lift = lifted(loss, states(64), 4_000)
-    weights, samples = lift.weights.unsqueeze(-1), lift.sampled_actions.latent
+    weights, samples = lift.weights.unsqueeze(-1), lift.actions.latent
     mean = (weights * samples).sum(0)
     variance = (weights * (samples - mean) ** 2).sum(0)
     reference = Normal(torch.tensor(LOC).double(), torch.tensor(SCALE).double())
@@ -151,7 +151,7 @@ def test_flat_score_and_no_entropy_leave_the_reference_where_it_is(tau, tau_prim
     if tau_prime == 0:
         assert_close(lift.weights, torch.full_like(lift.weights, 1 / 16))
         assert_close(lift.value, torch.zeros(5).double())
-    expected = (-tau_prime / (tau + tau_prime) * lift.reference_log_prob).softmax(0)
+    expected = (-tau_prime / (tau + tau_prime) * lift.actions.log_prob).softmax(0)
     assert_close(lift.weights, expected)
 
 
@@ -186,13 +186,13 @@ def test_uniform_reference(tau, tau_prime):
     ).double()
     lift = lifted(loss, states(7), 12)
     total = tau + tau_prime
-    assert_close(lift.reference_log_prob, torch.full((12, 7), -2 * math.log(2)).double())
+    assert_close(lift.actions.log_prob, torch.full((12, 7), -2 * math.log(2)).double())
     assert_close(lift.weights, (lift.score / total).softmax(0))
     log_mean_exp = (lift.score / total).logsumexp(0) - math.log(12)
     assert_close(lift.value, total * log_mean_exp + tau_prime * 2 * math.log(2))
 
 
-@pytest.mark.parametrize("quantity", ["weights", "value", "kl_target"])
+@pytest.mark.parametrize("quantity", ["weights", "value", "kl_target_reference"])
 def test_sampled_lift_converges_to_the_exact_one(quantity):
     """The root mean square error falls like 1 / sqrt(M): tenfold for a hundred times M."""
     tau, tau_prime = 0.5, 0.25
@@ -207,12 +207,12 @@ def test_sampled_lift_converges_to_the_exact_one(quantity):
         lift = lifted(loss, states(400), m)
         estimate, expected = {
             "weights": (
-                (lift.weights.unsqueeze(-1) * lift.sampled_actions.latent).sum(0),
+                (lift.weights.unsqueeze(-1) * lift.actions.latent).sum(0),
                 target.mean,
             ),
             "value": (lift.value, value),
-            "kl_target": (
-                loss._metrics(lift, *[loss._policies(states(400))[0]] * 2)["kl_target"],
+            "kl_target_reference": (
+                lift.actions.divergence_of(lift.weights, lift.log_weights),
                 kl_divergence(target, reference).sum(),
             ),
         }[quantity]
@@ -231,10 +231,10 @@ def test_projection_is_the_function_of_that_name(projection, kind):
     networks = make_networks(kind)
     loss = CASE.build(networks, projection=projection, reduction="none")
     batch = make_batch(kind)
-    policy = loss._distribution(batch, loss.actor_network_params)
+    at = loss.states(batch)
     torch.manual_seed(0)
-    actual, lift = loss.project(batch, policy, policy)
-    actions = lift.sampled_actions
+    actual, policy, lift = loss.project(at).loss, at.policy, at.lift
+    actions = lift.actions
     if projection == "centred":
         expected = centred_gaussian_projection(
             *gaussian_parameters(policy), actions.latent, lift.log_weights, sample_dim=0
@@ -281,7 +281,7 @@ def test_gradient_vanishes_at_the_projection(projection):
             parameter.data.copy_(value)
         torch.manual_seed(0)
         batch = states(2_000)
-        divergence, _ = loss.project(batch, *loss._policies(batch))
+        divergence, *_ = loss.project(loss.states(batch))
         return torch.stack(
             torch.autograd.grad(divergence.mean(), list(loss.actor_network.parameters()))
         )
@@ -301,7 +301,8 @@ def test_a_tanh_policy_is_projected_as_the_gaussian_below_it():
         )
         batch = states(6)
         torch.manual_seed(0)
-        divergence, lift = loss.project(batch, *loss._policies(batch))
+        at = loss.states(batch)
+        divergence, lift = loss.project(at).loss, at.lift
         grads = torch.autograd.grad(divergence.sum(), list(loss.actor_network.parameters()))
         outputs.append((divergence, lift.weights, *grads))
     assert_close(*outputs)
@@ -365,7 +366,7 @@ def test_the_least_of_the_soft_q_values_counts():
         inputs = TensorDict(
             {
                 "observation": batch["observation"].expand(50, 6, -1),
-                "action": lift.sampled_actions.action,
+                "action": lift.actions.action,
             },
             batch_size=[50, 6],
         )
@@ -387,13 +388,13 @@ def test_several_actions_at_the_next_state():
         target = loss.soft_bellman_target(batch) / 0.9
         following = batch["next"].select("observation")
         torch.manual_seed(0)
-        policy = loss._distribution(following, loss.actor_network_params)
+        policy = loss.states(following).policy
         lift = loss.lift(following, policy, loss.target_qvalue_network_params, n)
         total = CASE.tau + CASE.tau_prime
-        weights = (lift.score - CASE.tau_prime * lift.reference_log_prob) / total
+        weights = (lift.score - CASE.tau_prime * lift.actions.log_prob) / total
         assert_close(target, total * weights.exp().mean(0).log())
         if n == 1:
-            assert_close(target, (lift.score - CASE.tau_prime * lift.reference_log_prob)[0])
+            assert_close(target, (lift.score - CASE.tau_prime * lift.actions.log_prob)[0])
 
 
 def test_defaults():
@@ -482,7 +483,7 @@ def test_discrete_lift_and_losses_by_hand():
     assert_close(outputs["loss_actor"], cross_entropy)
     assert_close(outputs["entropy"].item(), log(4) - 0.75 * log(3))
     divergence = target[0] * (4 * target[0]).log() + target[1] * (4 / 3 * target[1]).log()
-    assert_close(outputs["kl_target"], divergence)
+    assert_close(outputs["kl_target_reference"], divergence)
     assert_close(outputs["qvalue"].item(), log(2) + log(3))
     # V(second state) = 2 log((1 + 3) / sqrt(2)), at gamma = 1/2; Q of the action is 2 log 3 (+ 1)
     bellman = 10 + 0.5 * 2 * log(4 / math.sqrt(2))
@@ -556,9 +557,9 @@ def test_both_projections_arrive_at_the_lift(name):
     assert_close(policy.probs[0].detach(), target.weights[:, 0], atol=1e-4, rtol=0)
     assert_close(outputs["state_value"], target.value[0])
     divergence = (target.weights * (target.weights.log() - target.reference)).sum()
-    assert_close(outputs["kl_target"], divergence)
+    assert_close(outputs["kl_target_reference"], divergence)
     reverse = (target.reference.exp() * (target.reference - target.weights.log())).sum()
-    assert_close(outputs["kl_to_reference"], reverse, atol=1e-4, rtol=0)
+    assert_close(outputs["kl_reference_policy"], reverse, atol=1e-4, rtol=0)
 
 
 def test_soft_values_of_a_tabular_problem_are_a_fixed_point():

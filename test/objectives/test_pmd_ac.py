@@ -189,7 +189,7 @@ def test_gradient_is_that_of_the_divergence_from_the_target(name, tau, tau_prime
     estimates = []
     for _ in range(25):
         batch = states(400)
-        divergence, _ = loss.project(batch, *loss._policies(batch))
+        divergence, *_ = loss.project(loss.states(batch))
         grads = torch.autograd.grad(divergence.mean(), list(parameters.parameters()))
         estimates.append(torch.stack(grads))
     estimates = torch.stack(estimates)
@@ -278,7 +278,7 @@ def test_pmd_ac_without_entropy():
 def test_one_sample_shows_no_divergence():
     """A learned tau needs several samples."""
     with pytest.raises(ValueError, match="1 samples cannot show more than log 1 = 0"):
-        CASE.build(target_kl=0.1, num_action_samples=1)
+        CASE.build(target_kl=0.1, num_action_samples=1)(make_batch())
 
 
 def test_projection_is_no_option():

@@ -1,11 +1,6 @@
 """LossModules: they read keys, call :mod:`torchrl_ecpo.functional`, reduce and report."""
 
-from torchrl_ecpo.objectives.actor_critic import (
-    ActorCriticLoss,
-    ContinuousActorCriticLoss,
-    DiscreteActorCriticLoss,
-    Lift,
-)
+from torchrl_ecpo.objectives.actor_critic import ActorCriticLoss, Lift, States
 from torchrl_ecpo.objectives.ecac import DiscreteECACLoss, ECACLoss
 from torchrl_ecpo.objectives.ecpo import ECPOLoss
 from torchrl_ecpo.objectives.ment import MENTLoss
@@ -21,8 +16,6 @@ from torchrl_ecpo.objectives.urex import UREXLoss
 
 __all__ = [
     "ActorCriticLoss",
-    "ContinuousActorCriticLoss",
-    "DiscreteActorCriticLoss",
     "DiscreteECACLoss",
     "DiscretePMDACLoss",
     "ECACLoss",
@@ -32,6 +25,7 @@ __all__ = [
     "MENTLoss",
     "PMDACLoss",
     "PMDLoss",
+    "States",
     "Steps",
     "TrajectoryGroupLoss",
     "TrajectoryGroups",

@@ -63,8 +63,9 @@ class PolicyLoss(LossModule):
         self.delay_actor = delay_actor
         self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
         self._allow_zero = allow_zero
+        device = next((parameter.device for parameter in self.parameters()), None)
         for name, value in self._as_temperatures(temperatures or {}).items():
-            self.register_coeff_buffer(name, value)
+            self.register_coeff_buffer(name, value, device=device)
         self.temperature_names = tuple(temperatures or ())
 
     def _as_temperatures(

@@ -1,11 +1,13 @@
-"""Actions at each state among which a lift chooses: M samples of a policy, or all there are.
+"""Actions that stand for a policy at each state: M samples of it, or all there are.
 
-Everywhere the axis of actions comes first: ``[M, *B]``, with ``*B`` the batch of states.
+Expectations, divergences and soft values over actions are sums over either. The axis of actions
+comes first everywhere: ``[M, *B]``, with ``*B`` the batch of states.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,20 +20,21 @@ from torch.distributions import (
     TransformedDistribution,
 )
 
-__all__ = ["SampledActions", "gaussian_parameters", "is_discrete", "log_prob_of", "sample_actions"]
+from torchrl_ecpo.functional import (
+    lift_divergence_estimate,
+    lifted_log_weights,
+    log_mean_exp,
+    soft_value,
+)
 
-
-class SampledActions(NamedTuple):
-    """M actions of a continuous policy at each state."""
-
-    action: Tensor
-    """``[M, *B, A]``."""
-    log_prob: Tensor
-    """``[M, *B]``, under the policy that drew them; in a space whose volume is the actions'."""
-    latent: Tensor
-    """``[M, *B, A]``, the action before the policy's transform (tanh), or the action itself."""
-    log_volume: Tensor | float
-    """``[M, *B]``, log-determinant of the transform at the latent, the same for every policy."""
+__all__ = [
+    "Actions",
+    "AllActions",
+    "SampledActions",
+    "actions_of",
+    "gaussian_parameters",
+    "is_discrete",
+]
 
 
 def is_discrete(distribution: type | Distribution) -> bool:
@@ -40,28 +43,135 @@ def is_discrete(distribution: type | Distribution) -> bool:
     return issubclass(kind, (Categorical, OneHotCategorical))
 
 
-def sample_actions(distribution: Distribution, num_samples: int) -> SampledActions:
-    """Draw M actions at each state, differentiable with respect to the policy where it is.
-
-    Log-probabilities are those of the latent that was drawn: a saturated tanh is never inverted.
+def actions_of(distribution: Distribution, num_samples: int) -> Actions:
+    """The actions that stand for a policy: all of one over n actions, samples of any other.
 
     Args:
-        distribution: of batch shape ``[*B]`` and event shape ``[A]``.
-        num_samples: M.
+        distribution: of batch shape ``[*B]``.
+        num_samples: M; without meaning where all actions are taken.
+
+    Raises:
+        ValueError: for a policy with neither.
     """
-    base, transforms = _split(distribution)
-    latent = base.rsample(torch.Size([num_samples]))
-    action, log_volume = latent, 0.0
-    for transform in transforms:
-        before, action = action, transform(action)
-        log_det = transform.log_abs_det_jacobian(before, action)
-        log_volume = log_volume + (log_det if transform.domain.event_dim else log_det.sum(-1))
-    return SampledActions(action, base.log_prob(latent) - log_volume, latent, log_volume)
+    if is_discrete(distribution):
+        return AllActions.of(distribution)
+    if distribution.has_rsample:
+        return SampledActions.of(distribution, num_samples)
+    raise ValueError(
+        "The policy must be over one of n actions (Categorical, OneHotCategorical) or over actions "
+        f"with rsample (TanhNormal), got {type(distribution).__name__}."
+    )
 
 
-def log_prob_of(actions: SampledActions, distribution: Distribution) -> Tensor:
-    """Log-probability ``[M, *B]`` under another policy of the same transform."""
-    return _split(distribution)[0].log_prob(actions.latent) - actions.log_volume
+class SampledActions(NamedTuple):
+    """M actions of a continuous policy at each state, which stand for it by their number."""
+
+    log_prob: Tensor
+    """``[M, *B]``, under the policy that drew them; in a space whose volume is the actions'."""
+    action: Tensor
+    """``[M, *B, A]``."""
+    latent: Tensor
+    """``[M, *B, A]``, the action before the policy's transform (tanh), or the action itself."""
+    log_volume: Tensor | float
+    """``[M, *B]``, log-determinant of the transform at the latent, the same for every policy."""
+
+    @classmethod
+    def of(cls, distribution: Distribution, num_samples: int) -> SampledActions:
+        """Draw M actions at each state, differentiable with respect to the policy where it is.
+
+        Log-probabilities are those of the latent that was drawn: a saturated tanh is never
+        inverted.
+        """
+        base, transforms = _split(distribution)
+        latent = base.rsample(torch.Size([num_samples]))
+        action, log_volume = latent, 0.0
+        for transform in transforms:
+            before, action = action, transform(action)
+            log_det = transform.log_abs_det_jacobian(before, action)
+            log_volume = log_volume + (log_det if transform.domain.event_dim else log_det.sum(-1))
+        return cls(base.log_prob(latent) - log_volume, action, latent, log_volume)
+
+    def log_prob_of(self, distribution: Distribution) -> Tensor:
+        """Log-probability ``[M, *B]`` under another policy of the same transform."""
+        return _split(distribution)[0].log_prob(self.latent) - self.log_volume
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Expectation ``[*B]`` under the policy of values ``[M, *B]``."""
+        return values.mean(0)
+
+    def lift(self, score: Tensor, tau: Tensor, tau_prime: Tensor) -> tuple[Tensor, Tensor]:
+        """Log-weights ``[M, *B]`` of the target, and its soft value ``[*B]``."""
+        log_weights = lifted_log_weights(score, self.log_prob, tau=tau, tau_prime=tau_prime)
+        return log_weights, (tau + tau_prime) * log_mean_exp(log_weights, sample_dim=0)
+
+    def divergence_of(self, weights: Tensor, log_weights: Tensor) -> Tensor:
+        """KL(target, policy) ``[*B]`` in nats, estimated; from normalised weights ``[M, *B]``."""
+        return lift_divergence_estimate(weights, sample_dim=0)
+
+    def entropy_target(self, target: float | str) -> float:
+        """What is meant by ``"auto"``: -A nats, SAC's."""
+        return -float(self.action.shape[-1]) if isinstance(target, str) else target
+
+    def divergence_bound(self, target_kl: float) -> float:
+        """In nats, from that per action dimension; which M samples must be able to show."""
+        bound, num_samples = self.action.shape[-1] * target_kl, len(self.action)
+        if bound >= math.log(num_samples):
+            raise ValueError(
+                f"target_kl={target_kl} per action dimension bounds KL(target, pi_bar) by "
+                f"{bound:.3g} nats, but {num_samples} samples cannot show more than "
+                f"log {num_samples} = {math.log(num_samples):.3g}: lower target_kl or raise "
+                "num_action_samples."
+            )
+        return bound
+
+
+class AllActions(NamedTuple):
+    """All n actions of a discrete policy; those that a mask forbids have no part in anything."""
+
+    log_prob: Tensor
+    """``[n, *B]``; of an action without probability very low, but finite."""
+
+    @classmethod
+    def of(cls, distribution: Any) -> AllActions:
+        """All actions of a categorical or one-hot policy."""
+        log_prob = distribution.logits.log_softmax(-1).movedim(-1, 0)
+        # Minus infinity times 0 would be NaN.
+        return cls(log_prob.masked_fill(log_prob == -torch.inf, _impossible(log_prob)))
+
+    def log_prob_of(self, distribution: Distribution) -> Tensor:
+        """Log-probability ``[n, *B]`` under another policy over the same actions."""
+        return AllActions.of(distribution).log_prob
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Expectation ``[*B]`` under the policy of values ``[n, *B]``."""
+        return (self.log_prob.exp() * values).sum(0)
+
+    def lift(self, score: Tensor, tau: Tensor, tau_prime: Tensor) -> tuple[Tensor, Tensor]:
+        """Log-weights ``[n, *B]`` of the target, and its soft value ``[*B]``, Eq. 8.
+
+        Nobody has drawn the actions: each counts by its probability.
+        """
+        temperatures = {"tau": tau, "tau_prime": tau_prime}
+        impossible = _impossible(score)
+        mask = ~(self.log_prob <= impossible)  # NaN is not impossible, but wrong
+        log_weights = lifted_log_weights(score, self.log_prob, **temperatures) + self.log_prob
+        value = soft_value(score, self.log_prob, **temperatures, sample_dim=0, mask=mask)
+        return log_weights.where(mask, impossible), value
+
+    def divergence_of(self, weights: Tensor, log_weights: Tensor) -> Tensor:
+        """KL(target, policy) ``[*B]`` in nats; from normalised weights ``[n, *B]``."""
+        return (weights * (log_weights.log_softmax(0) - self.log_prob)).sum(0)
+
+    def entropy_target(self, target: float | str) -> float:
+        """What is meant by ``"auto"``: 0.98 log n nats, that of TorchRL's ``DiscreteSACLoss``."""
+        return 0.98 * math.log(len(self.log_prob)) if isinstance(target, str) else target
+
+    def divergence_bound(self, target_kl: float) -> float:
+        """In nats, as it is given."""
+        return target_kl
+
+
+Actions = SampledActions | AllActions
 
 
 def gaussian_parameters(distribution: Distribution) -> tuple[Tensor, Tensor]:
@@ -84,3 +194,8 @@ def _split(distribution: Distribution) -> tuple[Distribution, list]:
     if isinstance(distribution, TransformedDistribution):
         return distribution.base_dist, distribution.transforms
     return distribution, []
+
+
+def _impossible(like: Tensor) -> float:
+    """A log-probability so low that nothing comes of it, and finite."""
+    return torch.finfo(like.dtype).min / 4

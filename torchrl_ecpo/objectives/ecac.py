@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
-from torch import Tensor
-from torch.distributions import Distribution
 
 from torchrl_ecpo.checks import check_choice, check_count
-from torchrl_ecpo.functional import centred_gaussian_projection, mean_seeking_projection
-from torchrl_ecpo.objectives.actions import gaussian_parameters, log_prob_of
-from torchrl_ecpo.objectives.actor_critic import (
-    ContinuousActorCriticLoss,
-    DiscreteActorCriticLoss,
-    Lift,
-    log_probs_of_all,
+from torchrl_ecpo.functional import (
+    Surrogate,
+    centred_gaussian_projection,
+    mean_seeking_projection,
 )
+from torchrl_ecpo.objectives.actions import SampledActions, gaussian_parameters
+from torchrl_ecpo.objectives.actor_critic import ActorCriticLoss, States
 
 __all__ = ["DiscreteECACLoss", "ECACLoss"]
 
 PROJECTIONS = ("centred", "paper")
 
 
-class ECACLoss(ContinuousActorCriticLoss):
+class ECACLoss(ActorCriticLoss):
     r"""ECAC for continuous actions: lift the reference policy by soft Q, project mean-seeking.
 
     "On Principled Entropy Exploration in Policy Optimization", Mei et al., IJCAI 2019, Eq. 8 to 11.
@@ -77,25 +73,24 @@ class ECACLoss(ContinuousActorCriticLoss):
             policy of this very update: one step a lift.
         delay_qvalue: whether the next state's value comes from delayed Q networks. Default: True,
             or False with a value network.
-        delay_value: must be True: a value network without delay diverges.
-        separate_losses: if True, parameters shared with the actor are trained by ``loss_actor``
-            alone. Default: False.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
         skip_done_states: if True, next states that are ``done`` are never looked at and count
             nothing, also those of a time limit. Default: False; nothing is expected after
             ``terminated`` states in either case, whatever stands there.
         use_prioritized_weights: whether losses are weighted by the entry ``"priority_weight"``;
             True and ``"auto"`` (default): if it is there.
-        deactivate_vmap: if True, the Q networks are called one after another. Default: False.
-            A network with a method ``each``, as :class:`~torchrl_ecpo.modules.DenseNetwork`, is
-            called by it in either case, with the samples along a first dimension ``[M, *B]``,
-            along which the states are expanded; other networks read them as more rows.
+
+    The Q networks are called one after another. One with a method ``each``, as
+    :class:`~torchrl_ecpo.modules.DenseNetwork` has, is called by it, with the samples along a first
+    dimension ``[M, *B]``, along which the states are expanded; other networks read them as more
+    rows.
 
     The outputs are ``loss_actor``, ``loss_qvalue``, ``loss_value`` (with a value network),
     ``loss_tau`` and ``loss_tau_prime`` (where learned), each reaching its own parameters only, so
     that their sum can be backpropagated at once; and, detached, ``ESS`` of the weights,
-    ``kl_target`` = KL(target, pi_bar), ``kl_to_reference`` = KL(pi_bar, pi_theta), ``entropy`` of
-    the reference, ``saturation`` (share of action components in the outer 5 % of their range),
+    ``kl_target_reference`` = KL(target, pi_bar), ``kl_reference_policy`` = KL(pi_bar, pi_theta),
+    ``entropy`` of the reference, ``saturation`` (share of action components in the outer 5 % of
+    their range),
     ``qvalue``, ``state_value``, ``tau`` and ``tau_prime``. The temporal difference error is written
     into the input as ``"td_error"``, 0 where the entry ``("collector", "mask")`` says that a
     transition is not real: such transitions are not looked at, whatever stands there.
@@ -135,83 +130,38 @@ class ECACLoss(ContinuousActorCriticLoss):
         >>> updater.step()
     """
 
-    _twin = "DiscreteECACLoss"
-
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
         qvalue_network: TensorDictModule | list[TensorDictModule],
         value_network: TensorDictModule | None = None,
         *,
-        tau: float = 0.3,
-        tau_prime: float = 1.0,
-        target_kl: float | None = 0.083,
-        target_entropy: float | Literal["auto"] | None = "auto",
-        min_tau: float = 0.001,
-        min_tau_prime: float = 0.003,
         projection: Literal["centred", "paper"] = "centred",
-        num_qvalue_nets: int = 2,
-        num_actor_states: int | None = None,
         num_action_samples: int = 8,
-        num_next_action_samples: int = 1,
-        loss_function: str = "l2",
-        delay_actor: bool = False,
-        delay_qvalue: bool | None = None,
-        delay_value: bool = True,
-        separate_losses: bool = False,
-        reduction: Literal["none", "mean", "sum"] | None = None,
-        skip_done_states: bool = False,
-        use_prioritized_weights: bool | Literal["auto"] = "auto",
-        deactivate_vmap: bool = False,
+        **options: Any,
     ) -> None:
         check_choice("projection", projection, PROJECTIONS)
         reason = ": weights are relative to those of the other actions"
         check_count("num_action_samples", num_action_samples, least=2, reason=reason)
-        super().__init__(
-            actor_network,
-            qvalue_network,
-            value_network,
-            tau=tau,
-            tau_prime=tau_prime,
-            target_kl=target_kl,
-            target_entropy=target_entropy,
-            min_tau=min_tau,
-            min_tau_prime=min_tau_prime,
-            num_qvalue_nets=num_qvalue_nets,
-            num_actor_states=num_actor_states,
-            num_action_samples=num_action_samples,
-            num_next_action_samples=num_next_action_samples,
-            loss_function=loss_function,
-            delay_actor=delay_actor,
-            delay_qvalue=delay_qvalue,
-            delay_value=delay_value,
-            separate_losses=separate_losses,
-            reduction=reduction,
-            skip_done_states=skip_done_states,
-            use_prioritized_weights=use_prioritized_weights,
-            deactivate_vmap=deactivate_vmap,
-        )
+        options |= {"num_action_samples": num_action_samples}
+        super().__init__(actor_network, qvalue_network, value_network, **options)
         self.projection = projection
 
-    def project(
-        self, tensordict: TensorDictBase, policy: Distribution, reference: Distribution
-    ) -> tuple[Tensor, Lift]:
-        """Eq. 11 with self-normalised weights, in nats; centred or to the letter."""
-        lift = self.lift(tensordict, reference, self.qvalue_network_params, self.num_action_samples)
-        actions = lift.sampled_actions
-        if self.projection == "centred":
-            loc, scale = gaussian_parameters(policy)
-            projection = centred_gaussian_projection(
-                loc, scale, actions.latent, lift.log_weights, sample_dim=0
-            )
-        else:
-            log_prob = log_prob_of(actions, policy)
-            projection = mean_seeking_projection(log_prob, lift.log_weights, sample_dim=0)
-        return projection.loss, lift
+    def project(self, states: States) -> Surrogate:
+        """Eq. 11 with the lift's weights, in nats; centred or to the letter."""
+        actions, log_weights = states.lift.actions, states.lift.log_weights
+        if self.projection == "paper":
+            log_prob = actions.log_prob_of(states.policy)
+            return mean_seeking_projection(log_prob, log_weights, sample_dim=0)
+        loc, scale = gaussian_parameters(states.policy)
+        assert isinstance(actions, SampledActions)
+        return centred_gaussian_projection(loc, scale, actions.latent, log_weights, sample_dim=0)
 
 
-class DiscreteECACLoss(DiscreteActorCriticLoss):
+class DiscreteECACLoss(ECACLoss):
     r"""ECAC for discrete actions: Eq. 8 and 11 summed over all actions, nothing sampled.
+
+    It is :class:`ECACLoss` with ``projection="paper"`` and other defaults.
 
     .. math::
         L(\theta) = -\sum_a \bar\pi^*(a|s) \log \pi_\theta(a|s), \quad
@@ -225,30 +175,17 @@ class DiscreteECACLoss(DiscreteActorCriticLoss):
         value_network: as for :class:`ECACLoss`.
 
     Keyword Args:
-        tau: as for :class:`ECACLoss`. Default: 0.3.
         tau_prime: as for :class:`ECACLoss`. Default: 0.1.
         target_kl: KL(target, pi_bar) in nats that tau is learned to hold. Default: 0.1.
         target_entropy: entropy in nats that tau_prime is learned to hold; ``"auto"`` is
             0.98 log n, that of TorchRL's ``DiscreteSACLoss``. None (default): tau_prime is fixed,
             or scheduled by assignment.
-        min_tau: as for :class:`ECACLoss`.
-        min_tau_prime: as for :class:`ECACLoss`.
-        num_qvalue_nets: as for :class:`ECACLoss`.
-        num_actor_states: as for :class:`ECACLoss`.
-        loss_function: as for :class:`ECACLoss`.
-        delay_actor: as for :class:`ECACLoss`.
-        delay_qvalue: as for :class:`ECACLoss`.
-        delay_value: as for :class:`ECACLoss`.
-        separate_losses: as for :class:`ECACLoss`.
-        reduction: as for :class:`ECACLoss`.
-        skip_done_states: as for :class:`ECACLoss`.
-        use_prioritized_weights: as for :class:`ECACLoss`.
-        deactivate_vmap: as for :class:`ECACLoss`.
+        options: as for :class:`ECACLoss`, but for those of samples.
 
     The outputs are those of :class:`ECACLoss` without ``saturation``.
 
     Raises:
-        ValueError: for continuous actions, and as for :class:`ECACLoss`.
+        ValueError: as for :class:`ECACLoss`.
 
     Examples:
         >>> import torch
@@ -273,59 +210,24 @@ class DiscreteECACLoss(DiscreteActorCriticLoss):
         >>> loss_module(batch)["loss_actor"].backward()
     """
 
-    _twin = "ECACLoss"
-
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
         qvalue_network: TensorDictModule | list[TensorDictModule],
         value_network: TensorDictModule | None = None,
         *,
-        tau: float = 0.3,
         tau_prime: float = 0.1,
         target_kl: float | None = 0.1,
         target_entropy: float | Literal["auto"] | None = None,
-        min_tau: float = 0.001,
-        min_tau_prime: float = 0.003,
-        num_qvalue_nets: int = 2,
-        num_actor_states: int | None = None,
-        loss_function: str = "l2",
-        delay_actor: bool = False,
-        delay_qvalue: bool | None = None,
-        delay_value: bool = True,
-        separate_losses: bool = False,
-        reduction: Literal["none", "mean", "sum"] | None = None,
-        skip_done_states: bool = False,
-        use_prioritized_weights: bool | Literal["auto"] = "auto",
-        deactivate_vmap: bool = False,
+        **options: Any,
     ) -> None:
         super().__init__(
             actor_network,
             qvalue_network,
             value_network,
-            tau=tau,
             tau_prime=tau_prime,
             target_kl=target_kl,
             target_entropy=target_entropy,
-            min_tau=min_tau,
-            min_tau_prime=min_tau_prime,
-            num_qvalue_nets=num_qvalue_nets,
-            num_actor_states=num_actor_states,
-            loss_function=loss_function,
-            delay_actor=delay_actor,
-            delay_qvalue=delay_qvalue,
-            delay_value=delay_value,
-            separate_losses=separate_losses,
-            reduction=reduction,
-            skip_done_states=skip_done_states,
-            use_prioritized_weights=use_prioritized_weights,
-            deactivate_vmap=deactivate_vmap,
+            projection="paper",
+            **options,
         )
-
-    def project(
-        self, tensordict: TensorDictBase, policy: Distribution, reference: Distribution
-    ) -> tuple[Tensor, Lift]:
-        """Eq. 11, in nats."""
-        lift = self.lift(tensordict, reference, self.qvalue_network_params, self.num_action_samples)
-        log_prob = log_probs_of_all(policy)
-        return mean_seeking_projection(log_prob, lift.log_weights, sample_dim=0).loss, lift

@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
-from torch import Tensor
-from torch.distributions import Distribution
 
-from torchrl_ecpo.objectives.actions import log_prob_of, sample_actions
-from torchrl_ecpo.objectives.actor_critic import (
-    ContinuousActorCriticLoss,
-    DiscreteActorCriticLoss,
-    Lift,
-    log_probs_of_all,
-)
+from torchrl_ecpo.functional import Surrogate
+from torchrl_ecpo.objectives.actions import AllActions, actions_of
+from torchrl_ecpo.objectives.actor_critic import ActorCriticLoss, States
 
 __all__ = ["DiscretePMDACLoss", "PMDACLoss"]
 
 
-class PMDACLoss(ContinuousActorCriticLoss):
+class PMDACLoss(ActorCriticLoss):
     r"""PMD-AC for continuous actions: ECAC's lift, and the mode-seeking projection KL(pi, target).
 
     With one reparameterised action of the policy at each state, in the unit of Q,
@@ -33,6 +26,8 @@ class PMDACLoss(ContinuousActorCriticLoss):
     ``tau_prime=0, target_entropy=None`` is the paper's PMD-AC, a positive tau_prime its
     PMD-AC+entropy. At tau = 0 it is SAC.
 
+    Over one of n actions it is (tau + tau') KL(pi, target) itself, summed over all of them.
+
     Args:
         actor_network: as for :class:`~torchrl_ecpo.ECACLoss`, with ``rsample``.
         qvalue_network: as for :class:`~torchrl_ecpo.ECACLoss`.
@@ -41,27 +36,12 @@ class PMDACLoss(ContinuousActorCriticLoss):
     Keyword Args:
         tau: temperature of the divergence from the reference, in the unit of Q. It has an effect
             with ``delay_actor=True`` only: a policy does not differ from itself. Default: 0.1.
-        tau_prime: temperature of the entropy, in the unit of Q; where it is learned, where it
-            starts. Default: 1, as ECAC's.
         target_kl: as for :class:`~torchrl_ecpo.ECACLoss`; needs several ``num_action_samples``.
             Default: None, a fixed tau.
-        target_entropy: as for :class:`~torchrl_ecpo.ECACLoss`. Default: ``"auto"``.
-        min_tau: as for :class:`~torchrl_ecpo.ECACLoss`.
-        min_tau_prime: as for :class:`~torchrl_ecpo.ECACLoss`.
-        num_qvalue_nets: as for :class:`~torchrl_ecpo.ECACLoss`.
-        num_actor_states: as for :class:`~torchrl_ecpo.ECACLoss`.
         num_action_samples: actions of the reference by which lift, metrics and the value network's
             target are estimated; the projection does not need them. Default: 1.
-        num_next_action_samples: as for :class:`~torchrl_ecpo.ECACLoss`.
-        loss_function: as for :class:`~torchrl_ecpo.ECACLoss`.
         delay_actor: as for :class:`~torchrl_ecpo.ECACLoss`. Default: True.
-        delay_qvalue: as for :class:`~torchrl_ecpo.ECACLoss`.
-        delay_value: as for :class:`~torchrl_ecpo.ECACLoss`.
-        separate_losses: as for :class:`~torchrl_ecpo.ECACLoss`.
-        reduction: as for :class:`~torchrl_ecpo.ECACLoss`.
-        skip_done_states: as for :class:`~torchrl_ecpo.ECACLoss`.
-        use_prioritized_weights: as for :class:`~torchrl_ecpo.ECACLoss`.
-        deactivate_vmap: as for :class:`~torchrl_ecpo.ECACLoss`.
+        options: as for :class:`~torchrl_ecpo.ECACLoss`, but for ``projection``.
 
     The outputs are those of :class:`~torchrl_ecpo.ECACLoss`.
 
@@ -92,8 +72,6 @@ class PMDACLoss(ContinuousActorCriticLoss):
         >>> sum(losses[:3]).backward()
     """
 
-    _twin = "DiscretePMDACLoss"
-
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
@@ -101,65 +79,38 @@ class PMDACLoss(ContinuousActorCriticLoss):
         value_network: TensorDictModule | None = None,
         *,
         tau: float = 0.1,
-        tau_prime: float = 1.0,
         target_kl: float | None = None,
-        target_entropy: float | Literal["auto"] | None = "auto",
-        min_tau: float = 0.001,
-        min_tau_prime: float = 0.003,
-        num_qvalue_nets: int = 2,
-        num_actor_states: int | None = None,
         num_action_samples: int = 1,
-        num_next_action_samples: int = 1,
-        loss_function: str = "l2",
         delay_actor: bool = True,
-        delay_qvalue: bool | None = None,
-        delay_value: bool = True,
-        separate_losses: bool = False,
-        reduction: Literal["none", "mean", "sum"] | None = None,
-        skip_done_states: bool = False,
-        use_prioritized_weights: bool | Literal["auto"] = "auto",
-        deactivate_vmap: bool = False,
+        **options: Any,
     ) -> None:
         super().__init__(
             actor_network,
             qvalue_network,
             value_network,
             tau=tau,
-            tau_prime=tau_prime,
             target_kl=target_kl,
-            target_entropy=target_entropy,
-            min_tau=min_tau,
-            min_tau_prime=min_tau_prime,
-            num_qvalue_nets=num_qvalue_nets,
-            num_actor_states=num_actor_states,
             num_action_samples=num_action_samples,
-            num_next_action_samples=num_next_action_samples,
-            loss_function=loss_function,
             delay_actor=delay_actor,
-            delay_qvalue=delay_qvalue,
-            delay_value=delay_value,
-            separate_losses=separate_losses,
-            reduction=reduction,
-            skip_done_states=skip_done_states,
-            use_prioritized_weights=use_prioritized_weights,
-            deactivate_vmap=deactivate_vmap,
+            **options,
         )
 
-    def project(
-        self, tensordict: TensorDictBase, policy: Distribution, reference: Distribution
-    ) -> tuple[Tensor, Lift]:
-        """(tau + tau') KL(pi_theta, target) by one reparameterised action, in the unit of Q."""
-        actions = sample_actions(policy, 1)
-        score = self._qvalue_of(tensordict, actions.action, self.qvalue_network_params.data)
+    def project(self, states: States) -> Surrogate:
+        """(tau + tau') KL(pi_theta, target), in the unit of Q: by one action, or summed."""
         tau, tau_prime = self.temperatures()
+        actions = actions_of(states.policy, 1)
+        if isinstance(actions, AllActions):
+            log_target = states.lift.log_weights.log_softmax(0)
+            divergence = actions.mean(actions.log_prob - log_target)
+            return Surrogate((tau + tau_prime) * divergence, states.lift.weights)
+        score = self.score_of(states.observations, actions, self.qvalue_network_params.data)
         loss = tau_prime * actions.log_prob - score
-        if reference is not policy:  # which does not differ from itself
-            loss = loss + tau * (actions.log_prob - log_prob_of(actions, reference))
-        lift = self.lift(tensordict, reference, self.qvalue_network_params, self.num_action_samples)
-        return loss.squeeze(0), lift
+        if states.reference is not states.policy:  # which does not differ from itself
+            loss = loss + tau * (actions.log_prob - actions.log_prob_of(states.reference))
+        return Surrogate(loss.squeeze(0), states.lift.weights)
 
 
-class DiscretePMDACLoss(DiscreteActorCriticLoss):
+class DiscretePMDACLoss(PMDACLoss):
     r"""PMD-AC for discrete actions: (tau + tau') KL(pi, target), summed over all actions.
 
     Args:
@@ -168,23 +119,9 @@ class DiscretePMDACLoss(DiscreteActorCriticLoss):
         value_network: as for :class:`~torchrl_ecpo.DiscreteECACLoss`.
 
     Keyword Args:
-        tau: as for :class:`PMDACLoss`. Default: 0.1.
         tau_prime: as for :class:`PMDACLoss`. Default: 0.1.
-        target_kl: as for :class:`~torchrl_ecpo.DiscreteECACLoss`. Default: None, a fixed tau.
         target_entropy: as for :class:`~torchrl_ecpo.DiscreteECACLoss`. Default: None.
-        min_tau: as for :class:`~torchrl_ecpo.ECACLoss`.
-        min_tau_prime: as for :class:`~torchrl_ecpo.ECACLoss`.
-        num_qvalue_nets: as for :class:`~torchrl_ecpo.ECACLoss`.
-        num_actor_states: as for :class:`~torchrl_ecpo.ECACLoss`.
-        loss_function: as for :class:`~torchrl_ecpo.ECACLoss`.
-        delay_actor: as for :class:`PMDACLoss`. Default: True.
-        delay_qvalue: as for :class:`~torchrl_ecpo.ECACLoss`.
-        delay_value: as for :class:`~torchrl_ecpo.ECACLoss`.
-        separate_losses: as for :class:`~torchrl_ecpo.ECACLoss`.
-        reduction: as for :class:`~torchrl_ecpo.ECACLoss`.
-        skip_done_states: as for :class:`~torchrl_ecpo.ECACLoss`.
-        use_prioritized_weights: as for :class:`~torchrl_ecpo.ECACLoss`.
-        deactivate_vmap: as for :class:`~torchrl_ecpo.ECACLoss`.
+        options: as for :class:`PMDACLoss`, but for those of samples.
 
     The outputs are those of :class:`~torchrl_ecpo.DiscreteECACLoss`.
 
@@ -207,61 +144,21 @@ class DiscretePMDACLoss(DiscreteActorCriticLoss):
         >>> loss_actor.backward()
     """
 
-    _twin = "PMDACLoss"
-
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
         qvalue_network: TensorDictModule | list[TensorDictModule],
         value_network: TensorDictModule | None = None,
         *,
-        tau: float = 0.1,
         tau_prime: float = 0.1,
-        target_kl: float | None = None,
         target_entropy: float | Literal["auto"] | None = None,
-        min_tau: float = 0.001,
-        min_tau_prime: float = 0.003,
-        num_qvalue_nets: int = 2,
-        num_actor_states: int | None = None,
-        loss_function: str = "l2",
-        delay_actor: bool = True,
-        delay_qvalue: bool | None = None,
-        delay_value: bool = True,
-        separate_losses: bool = False,
-        reduction: Literal["none", "mean", "sum"] | None = None,
-        skip_done_states: bool = False,
-        use_prioritized_weights: bool | Literal["auto"] = "auto",
-        deactivate_vmap: bool = False,
+        **options: Any,
     ) -> None:
         super().__init__(
             actor_network,
             qvalue_network,
             value_network,
-            tau=tau,
             tau_prime=tau_prime,
-            target_kl=target_kl,
             target_entropy=target_entropy,
-            min_tau=min_tau,
-            min_tau_prime=min_tau_prime,
-            num_qvalue_nets=num_qvalue_nets,
-            num_actor_states=num_actor_states,
-            loss_function=loss_function,
-            delay_actor=delay_actor,
-            delay_qvalue=delay_qvalue,
-            delay_value=delay_value,
-            separate_losses=separate_losses,
-            reduction=reduction,
-            skip_done_states=skip_done_states,
-            use_prioritized_weights=use_prioritized_weights,
-            deactivate_vmap=deactivate_vmap,
+            **options,
         )
-
-    def project(
-        self, tensordict: TensorDictBase, policy: Distribution, reference: Distribution
-    ) -> tuple[Tensor, Lift]:
-        """(tau + tau') KL(pi_theta, target), in the unit of Q."""
-        lift = self.lift(tensordict, reference, self.qvalue_network_params, self.num_action_samples)
-        log_prob = log_probs_of_all(policy)
-        tau, tau_prime = self.temperatures()
-        divergence = (log_prob.exp() * (log_prob - lift.log_weights.log_softmax(0))).sum(0)
-        return (tau + tau_prime) * divergence, lift
