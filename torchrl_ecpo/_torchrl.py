@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import torch
 from torchrl.data.replay_buffers import ReplayBuffer, Storage
+from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
@@ -11,6 +13,7 @@ PRIVATE_NAMES: tuple[tuple[object, str], ...] = (
     (LossModule(), "_has_update_associated"),  # of each instance
     (EnvBase, "_step_proc_data"),  # overridden by AlgorithmicEnv: saves a tenth of a step
     (Storage, "_attached_entities"),
+    (Sampler, "_rng"),
 )
 """Names used here; ``test/test_private_names.py`` says which one a new version has lost."""
 
@@ -40,3 +43,11 @@ def buffers_of(storage: Storage) -> list[ReplayBuffer]:
     written, only the buffer's writer knows.
     """
     return storage._attached_entities
+
+
+def generator_of(sampler: Sampler) -> torch.Generator | None:
+    """The random generator that a buffer was built with, ``ReplayBuffer(generator=...)``.
+
+    The buffer hands it to its sampler under this name alone.
+    """
+    return sampler._rng

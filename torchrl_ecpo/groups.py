@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl.data.replay_buffers import RoundRobinWriter, Storage
 from torchrl.data.replay_buffers.samplers import Sampler
 
-from torchrl_ecpo._torchrl import buffers_of
+from torchrl_ecpo._torchrl import buffers_of, generator_of
 from torchrl_ecpo.checks import (
     check_count,
     check_group_size,
@@ -571,8 +571,9 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
         return torch.isin(whole.group, drawn, invert=True).nonzero().squeeze(-1)
 
     def _shuffle(self, number: int) -> Tensor:
-        device = None if self._rng is None else self._rng.device
-        return torch.randperm(number, generator=self._rng, device=device).cpu()
+        generator = generator_of(self)
+        device = None if generator is None else generator.device
+        return torch.randperm(number, generator=generator, device=device).cpu()
 
     def _num_groups(self, batch_size: int) -> int:
         num_groups, rest = divmod(batch_size, self.group_size)
