@@ -566,7 +566,7 @@ def test_worker_processes(sync):
         assert len(collector.state_dict()["players"]) == len(workers)
         collector.total_frames = float("inf")
         os.kill(workers[0].pid, signal.SIGKILL)
-        with pytest.raises(ChildProcessError, match=r"Worker 0 .* by SIGKILL.* resume=auto"):
+        with pytest.raises(ChildProcessError, match=r"Worker 0 .* by SIGKILL.* last checkpoint"):
             list(collector)
     assert not any(process.is_alive() for process in workers)
     assert 250 <= frames < 250 + (4 if sync else 2) * 3 * 6  # a batch's groups, copies and steps
@@ -610,6 +610,6 @@ def test_ray_workers():
                 break
         assert len(set(groups)) == len(groups)
         ray.kill(collector._workers._workers[1].actor)
-        with pytest.raises(ChildProcessError, match=r"Worker 1 .* Ray cluster.* resume=auto"):
+        with pytest.raises(ChildProcessError, match=r"Worker 1 .* Ray cluster.* last checkpoint"):
             next(iter(collector))
     assert not ray.is_initialized()

@@ -153,8 +153,7 @@ class Workers:
     def _death(self, worker: int) -> ChildProcessError:
         return ChildProcessError(
             f"Worker {worker} of the collector {self._workers[worker].cause()}. The run cannot go "
-            "on without it; start the run again with resume=<run directory> or resume=auto to go "
-            "on from its last checkpoint."
+            "on without it: resume it from its last checkpoint."
         )
 
 
