@@ -28,6 +28,7 @@ from torchrl.modules import (
     TanhNormal,
     set_recurrent_mode,
 )
+from torchrl.objectives import HardUpdate
 
 from torchrl_ecpo.objectives import (
     ECPOLoss,
@@ -388,6 +389,28 @@ CASES = {
     "ment": Case(MENTLoss, {"tau": 0.4}, ment),
 }
 LIFTING = ("ecpo", "pmd")
+
+
+def problem(
+    case: Case, kind: str = "categorical", *, padded: bool = True, **options: Any
+) -> tuple[TrajectoryGroupLoss, Any, TensorDict]:
+    """A loss, its actor after some optimiser steps, and a batch ``[2, 3, 4]`` from before them.
+
+    With ``delay_actor`` the loss's reference is the policy that drew the batch.
+    """
+    actor = make_actor(kind)
+    batch = sample(actor, 2, 3, 4)
+    loss = case.build(actor, **options)
+    loss.set_keys(**ACTOR_KEYS.get(kind, {}))
+    if loss.delay_actor:
+        HardUpdate(loss, value_network_update_interval=1)
+    move(actor)
+    return loss, actor, pad(batch) if padded else batch
+
+
+def expected_losses(case: Case, actor: Any, batch: TensorDictBase, *reference: Any) -> Tensor:
+    """The formula, one number for each group."""
+    return torch.stack([case.expected(actor, group, *reference)[0] for group in split(batch)])
 
 
 def gradients(value: Tensor, actor: nn.Module) -> list[Tensor]:
