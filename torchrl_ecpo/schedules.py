@@ -41,9 +41,6 @@ def constant(value: float) -> Schedule:
 def linear(start: float, end: float, duration: float) -> Schedule:
     """From ``start`` to ``end`` in a straight line over ``duration`` counts, then ``end``.
 
-    Raises:
-        ValueError: if ``duration`` is not positive.
-
     Examples:
         >>> tau_prime = linear(0.02, 0.0, 100)
         >>> [tau_prime(count) for count in (0, 50, 100, 200)]
@@ -54,10 +51,7 @@ def linear(start: float, end: float, duration: float) -> Schedule:
 
 
 def exponential(start: float, end: float, duration: float) -> Schedule:
-    """From ``start`` to ``end`` by a constant factor over ``duration`` counts, then ``end``.
-
-    Raises:
-        ValueError: if ``duration``, ``start`` or ``end`` is not positive.
+    """From ``start`` to ``end``, both above 0, by a constant factor over ``duration`` counts.
 
     Examples:
         >>> tau_prime = exponential(0.02, 0.0002, 100)
