@@ -8,8 +8,8 @@ Shapes
 Every function works along one axis of *samples*, ``sample_dim``: the K trajectories of a group, or
 the M actions drawn at a state (or all actions, where a sum is exact). ``E*`` stands for the shape
 that is left when this axis is taken out: any number of dimensions, also none. So ``[E*, K]`` is a
-tensor with the sample axis inserted at ``sample_dim`` and ``[E*]`` has one number per group.
-Nothing is averaged over ``E*``: the caller decides.
+tensor with the sample axis inserted at ``sample_dim`` and ``[E*]``, the shape of a result unless
+another is stated, has one number per group. Nothing is averaged over ``E*``: the caller decides.
 
 Symbols
 -------
@@ -28,6 +28,7 @@ tau_prime            tau' >= 0        temperature of the entropy
 sample_dim                            the axis of the samples; the last by default
 mask                                  ``[E*, K]``, True where a sample is real (an action is
                                       allowed); None, the default: all are
+values, weights                       ``[E*, K]``; values may carry a gradient
 keepdim                               whether the sample axis stays, with length 1
 ==================== ================ =====================================================
 
@@ -102,13 +103,8 @@ class _Where(TypedDict):
 def check_temperatures(*, allow_zero: bool = False, **temperatures: float | Tensor) -> None:
     """Refuse temperatures for which a loss is not defined.
 
-    Args:
-        allow_zero: whether all may be 0 together.
-        temperatures: by name; each must be finite and at least 0, and, where there are any, one
-            above 0. Tensors are not looked at.
-
-    Raises:
-        ValueError: naming the temperature, what came, and the mend.
+    Each must be finite and at least 0, and one above 0, unless ``allow_zero``. Tensors are not
+    looked at.
 
     Examples:
         >>> check_temperatures(tau=0.5, tau_prime=0.01)
@@ -186,12 +182,8 @@ def effective_sample_size(weights: Tensor, *, sample_dim: int = -1) -> Tensor:
 
     .. math:: \mathrm{ESS} = \frac{(\sum_k w_k)^2}{\sum_k w_k^2}
 
-    Args:
-        weights: ``[E*, K]``, non-negative, normalised or not.
-
-    Returns:
-        ``[E*]``, from 1 (one sample has all the weight) to K (all are equal); 0 for a group
-        without weight.
+    It is 1 where one sample has all the weight, K where all are equal, and 0 for a group without
+    weight. The weights are non-negative, normalised or not.
 
     Examples:
         1 / (0.75**2 + 0.25**2) = 1.6:
@@ -216,12 +208,8 @@ def lift_divergence_estimate(
     .. math::
         \mathrm{KL}(\bar\pi^*_{\tau,\tau'} \| \bar\pi) \approx \sum_m w_m \log (M w_m)
 
-    Args:
-        weights: ``[E*, M]``, :func:`self_normalised_weights` of samples that the reference drew.
-
-    Returns:
-        ``[E*]``, in nats, from 0 (equal weights) to log M (all weight on one sample), which it
-        cannot exceed, whatever the true divergence is.
+    with w the :func:`self_normalised_weights` of M samples that the reference drew. In nats, from 0
+    (equal weights) to log M (all weight on one sample), whatever the true divergence is.
 
     Examples:
         >>> lift_divergence_estimate(torch.tensor([[0.5, 0.5], [1.0, 0.0]])) / math.log(2)
@@ -244,10 +232,7 @@ def temperature_dual(log_temperature: Tensor, excess: Tensor) -> Tensor:
 
     Args:
         log_temperature: ``[]``; carries the gradient.
-        excess: ``[...]``; above 0 where the temperature is too low.
-
-    Returns:
-        ``[...]``.
+        excess: ``[...]``, the shape of the loss; above 0 where the temperature is too low.
 
     Examples:
         >>> log_tau = torch.tensor(0.5).log().requires_grad_()
@@ -328,11 +313,10 @@ def centred_gaussian_projection(
         \frac{\partial L}{\partial \log \sigma} = 1 - \frac{S}{\sigma^2}, \qquad
         S = \frac{\sum_m w_m (u_m - m)^2}{1 - \sum_m w_m^2}
 
-    The gradient of the mean is the same, and so is the minimiser, as M grows: mean and variance of
-    the target. What changes is the way there: it is a block-coordinate step, in which the
-    scale goes where it would go if the mean had arrived, no longer gradient descent on Eq. 11.
-    The weights of a lift do depend on the samples, so that S is somewhat too small where M is: by
-    about 5 % at M = 8 for a lift that moves the mean by half a standard deviation.
+    The gradient of the mean is the same, and so is the minimiser, as M grows. The way there is a
+    block-coordinate step: the scale goes where it would go if the mean had arrived. The weights of
+    a lift do depend on the samples, so that S is too small by about 5 % at M = 8 for a lift that
+    moves the mean by half a standard deviation.
 
     Args:
         loc: ``[E*, A]``, mean of the policy being trained; carries the gradient.
@@ -343,9 +327,8 @@ def centred_gaussian_projection(
         sample_dim: the axis of the M samples, in ``log_weights``.
 
     Returns:
-        :class:`Surrogate`: the loss ``[E*]`` in nats, a cross-entropy with the variance above, and
-        the weights. Where all weight is on one sample, there is no telling a width from it, and
-        the scale gets no gradient.
+        :class:`Surrogate`: the loss is a cross-entropy in nats, with the variance above. Where all
+        weight is on one sample, which tells no width, the scale gets no gradient.
 
     Examples:
         Two equal weights at 1 and 3: m = 2, S = 1 / (1 - 1/2) = 2.
@@ -443,13 +426,7 @@ def urex_surrogate(
         w = \mathrm{softmax}_k(r_k / \tau - \log \pi_\theta(\rho_k))
 
     with S held constant and :math:`\bar S` its mean over the group. The samples are the current
-    policy's. The weights are ECPO's at tau = 0 and tau' = UREX's tau.
-
-    Args:
-        tau: UREX's temperature; above 0.
-
-    Returns:
-        :class:`Surrogate`: its weights are w.
+    policy's. UREX's tau is above 0. The weights w are ECPO's at tau = 0 and tau' = UREX's tau.
 
     Examples:
         Equal log-probabilities and tau = 1/log 3 give w = (3/4, 1/4), S = (1 + 1.5 tau, 0.5 tau):
@@ -485,13 +462,8 @@ def ment_surrogate(
         L(\theta) = -\frac1K \sum_k (S_k - \bar S) \log \pi_\theta(\rho_k), \quad
         S_k = r_k - \tau \log \pi_\theta(\rho_k)
 
-    with S held constant. The samples are the current policy's.
-
-    Args:
-        tau: temperature of the entropy; 0 is plain REINFORCE.
-
-    Returns:
-        :class:`Surrogate`: its weights are uniform.
+    with S held constant. The samples are the current policy's, and the weights uniform. Here tau is
+    the temperature of the entropy; 0 is plain REINFORCE.
 
     Examples:
         S = (1 + 0.5 * 1, 0 + 0.5 * 1), so S - mean = +-1/2 and the gradient -+1/4:
@@ -526,9 +498,8 @@ def soft_value(
         \bar V^*(s) = (\tau + \tau') \log \sum_a
             \exp \frac{\bar Q^*(s, a) + \tau \log \bar\pi(a|s)}{\tau + \tau'}
 
-    Returns:
-        ``[E*]``, in the unit of the score, the maximum of
-        E score - tau KL(pi, pi_bar) + tau' H(pi) over all distributions pi.
+    In the unit of the score: the maximum of E score - tau KL(pi, pi_bar) + tau' H(pi) over all
+    distributions pi.
 
     Examples:
         Two equal actions, log pi_bar = -log 2: 1 + tau' log 2, their score and an entropy bonus.
@@ -560,11 +531,8 @@ def soft_value_estimate(
             \exp \frac{\bar Q^*(s, a_m) - \tau' \log \bar\pi(a_m|s)}{\tau + \tau'},
         \qquad a_m \sim \bar\pi(\cdot|s)
 
-    A lower bound in expectation (Jensen), consistent as M grows; with M = 1 it is the paper's
-    one-sample estimate Q - tau' log pi_bar (Eq. 9).
-
-    Returns:
-        ``[E*]``, in the unit of the score.
+    In the unit of the score. A lower bound in expectation (Jensen), consistent as M grows; with
+    M = 1 it is the paper's one-sample estimate Q - tau' log pi_bar (Eq. 9).
 
     Examples:
         One sample: 1 - 0.25 * -2 = 1.5.
@@ -664,13 +632,10 @@ def theorem1_temperatures(horizon: float, num_trajectories: int) -> tuple[float,
 
 
 def uniform_weights(like: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None) -> Tensor:
-    """1/K for each of the K real samples of a group, 0 for the others.
+    """``[E*, K]``, 1/K for each of the K real samples of a group, 0 for the others.
 
     Args:
         like: ``[E*, K]``, whose shape, dtype and device the weights get.
-
-    Returns:
-        ``[E*, K]``.
 
     Examples:
         >>> uniform_weights(torch.rand(3), mask=torch.tensor([True, True, False]))
@@ -691,12 +656,7 @@ def weighted_sum(
 ) -> Tensor:
     """Sum of weights times values over the real samples, whatever stands in the masked ones.
 
-    Args:
-        weights: ``[E*, K]``; clipped where the sum would overflow, so that a gradient is left.
-        values: ``[E*, K]``; may carry a gradient.
-
-    Returns:
-        ``[E*]``.
+    Weights are clipped where the sum would overflow, so that a gradient is left.
 
     Examples:
         >>> weights, values = torch.tensor([0.5, 0.5, 0.5]), torch.tensor([1.0, 3.0, math.nan])
@@ -714,13 +674,7 @@ def weighted_sum(
 def masked_mean(
     values: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None, keepdim: bool = False
 ) -> Tensor:
-    """Mean over the real samples of a group, whatever stands in the masked ones.
-
-    Args:
-        values: ``[E*, K]``; may carry a gradient.
-
-    Returns:
-        ``[E*]``; 0 for a group without a real sample.
+    """Mean over the real samples, whatever stands in the masked ones; 0 where all are masked.
 
     Examples:
         >>> masked_mean(torch.tensor([1.0, 3.0, math.nan]), mask=torch.tensor([True, True, False]))
@@ -733,8 +687,7 @@ def masked_mean(
 def centred(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None) -> Tensor:
     """Scores less the mean of their group: REINFORCE's advantage with the group as baseline.
 
-    Returns:
-        ``[E*, K]``, detached; 0 where masked.
+    ``[E*, K]``, detached; 0 where masked.
 
     Examples:
         >>> centred(torch.tensor([1.0, 2.0, 9.0]), mask=torch.tensor([True, True, False]))
@@ -782,9 +735,6 @@ def score_function_loss(
 
     Args:
         advantage: ``[E*, K]``, held constant: :func:`centred` or :func:`standardised` scores.
-
-    Returns:
-        ``[E*]``.
 
     Examples:
         >>> log_prob = torch.tensor([-1.0, -2.0], requires_grad=True)
