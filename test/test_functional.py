@@ -686,25 +686,17 @@ def test_leading_shapes_and_sample_dim(name, shape, masked):
 @every_function
 @pytest.mark.parametrize("masked", [False, True])
 def test_dtype_is_kept(name, dtype, masked):
+    """That of the scores, also where temperatures are tensors of another."""
     x = random_samples(2, 4, dtype=dtype)
     mask = torch.tensor([True, True, False, True]).expand(2, 4) if masked else None
-    value, per_sample = evaluate(name, x, mask=mask)
-    assert value.dtype == dtype
-    assert {y.dtype for y in per_sample} == {dtype}
     double = evaluate(name, x.map(Tensor.double), mask=mask)
-    assert_close(value.double(), double.value, atol=1e-5, rtol=1e-5)
-
-
-@every_function
-@pytest.mark.parametrize("temperature_dtype", [torch.float32, torch.float64], ids=str)
-def test_temperatures_may_be_tensors(name, temperature_dtype):
-    x = random_samples(2, 4, dtype=torch.float32)
-    tau, tau_prime = torch.tensor([0.5, 0.25], dtype=temperature_dtype)
-    result = evaluate(name, x, tau, tau_prime)
-    assert result.value.dtype == torch.float32
-    expected = evaluate(name, x, 0.5, 0.25)
-    assert_close(result.value, expected.value)
-    assert_close(result.per_sample, expected.per_sample)
+    for temperatures in ((0.5, 0.25), torch.tensor([0.5, 0.25]), vector(0.5, 0.25)):
+        value, per_sample = evaluate(name, x, *temperatures, mask=mask)
+        assert value.dtype == dtype
+        assert {y.dtype for y in per_sample} == {dtype}
+        assert_close(value.double(), double.value, atol=1e-5, rtol=1e-5)
+        per_sample = tuple(y.double() for y in per_sample)
+        assert_close(per_sample, double.per_sample, atol=1e-5, rtol=1e-5)
 
 
 EXTREME_SCORES = st.sampled_from([-1e30, -1.0, 0.0, 1.0, 1e30]) | st.floats(-1e30, 1e30)
@@ -873,18 +865,19 @@ def gaussian_gradient(projection, loc, scale, samples, log_weights, **where) -> 
     return GaussianGradient(loss.detach(), *torch.autograd.grad(loss.sum(), (loc, log_scale)))
 
 
+centred_gradient = functools.partial(gaussian_gradient, centred_gaussian_projection)
+
+
 def paper_projection(loc, scale, samples, log_weights, *, sample_dim=-1) -> Surrogate:
     """Eq. 11 of a diagonal Gaussian, ``samples`` ``[M, *B, A]`` with the axis 0."""
     log_prob = torch.distributions.Normal(loc, scale).log_prob(samples).sum(-1)
     return mean_seeking_projection(log_prob, log_weights, sample_dim=sample_dim)
 
 
-def sample_variance(projection, samples: Tensor, log_weights: Tensor) -> Tensor:
+def sample_variance(samples: Tensor, log_weights: Tensor) -> Tensor:
     """The S that the scale is fitted to, ``[*B]``: of the gradient 1 - S at a standard Gaussian."""
     zero = torch.zeros(*samples.shape[1:], dtype=samples.dtype)
-    grad = gaussian_gradient(
-        projection, zero, torch.ones_like(zero), samples, log_weights, sample_dim=0
-    )
+    grad = centred_gradient(zero, torch.ones_like(zero), samples, log_weights, sample_dim=0)
     return (1 - grad.log_scale).squeeze(-1)
 
 
@@ -895,9 +888,7 @@ def test_centred_gaussian_projection_by_hand(dtype):
     samples = vector(0, 4, 8, dtype=dtype).unsqueeze(-1)
     loc, scale = vector(2, dtype=dtype), vector(2, dtype=dtype)
     variance = 8 / (34 / 64)
-    grad = gaussian_gradient(
-        centred_gaussian_projection, loc, scale, samples, log_weights, sample_dim=0
-    )
+    grad = centred_gradient(loc, scale, samples, log_weights, sample_dim=0)
     assert_close(grad.mean.item(), (2 - 6) / 4)
     assert_close(grad.log_scale.item(), 1 - variance / 4)
     expected = math.log(2) + 0.5 * (variance / 4 + (6 - 2) ** 2 / 4 + math.log(2 * math.pi))
@@ -922,23 +913,22 @@ def test_centred_projection_of_any_shape(shape, masked):
         mask[..., 0] = True
         log_weights = log_weights.where(mask, math.nan)
         samples = samples.where(mask.unsqueeze(-1), math.inf)
-    gaussian = functools.partial(gaussian_gradient, centred_gaussian_projection)
-    expected = gaussian(loc, scale, samples, log_weights, mask=mask)
+    expected = centred_gradient(loc, scale, samples, log_weights, mask=mask)
     assert expected.loss.shape == shape
     assert all(value.isfinite().all() for value in expected)
     for i in itertools.product(*map(range, shape)):
         real = slice(None) if mask is None else mask[i]
-        one = gaussian(loc[i], scale[i], samples[i][real], log_weights[i][real])
+        one = centred_gradient(loc[i], scale[i], samples[i][real], log_weights[i][real])
         assert_close(tuple(one), tuple(value[i] for value in expected))
     for dim in range(-len(shape) - 1, len(shape) + 1):
         at = dim % (len(shape) + 1)
         at_dim = None if mask is None else mask.movedim(-1, at)
         moved = samples.movedim(-2, at), log_weights.movedim(-1, at)
-        moved = gaussian(loc, scale, *moved, sample_dim=dim, mask=at_dim)
+        moved = centred_gradient(loc, scale, *moved, sample_dim=dim, mask=at_dim)
         assert_close(tuple(moved), tuple(expected))
     if masked and shape:
         mask[0] = False  # a state without a real sample leaves the policy as it is
-        for values in gaussian(loc, scale, samples, log_weights, mask=mask):
+        for values in centred_gradient(loc, scale, samples, log_weights, mask=mask):
             assert (values[0] == 0).all()
             assert (values[1] != 0).all()
 
@@ -964,14 +954,8 @@ def test_centred_projection_trains_the_policy_only():
 def test_one_sample_says_nothing_of_the_scale(dtype, log_weights):
     """Where all weight is on one sample the scale stays, the mean goes there."""
     samples = torch.arange(1.0, len(log_weights) + 1, dtype=dtype).unsqueeze(-1)
-    grad = gaussian_gradient(
-        centred_gaussian_projection,
-        vector(0, dtype=dtype),
-        vector(0.5, dtype=dtype),
-        samples,
-        vector(*log_weights, dtype=dtype),
-        sample_dim=0,
-    )
+    loc, scale, log_weights = (vector(*x, dtype=dtype) for x in ((0,), (0.5,), log_weights))
+    grad = centred_gradient(loc, scale, samples, log_weights, sample_dim=0)
     assert_close(grad.mean.item(), -4.0)
     assert_close(grad.log_scale.item(), 0.0, atol=1e-6, rtol=0)
     assert grad.loss.isfinite()
@@ -987,14 +971,8 @@ def test_centred_projection_of_finite_input_is_never_nan(data, dtype):
     ]
     log_weights, samples = (torch.tensor(row, dtype=dtype) for row in rows)
     scale = torch.tensor([data.draw(st.sampled_from([1e-4, 1.0, 10.0]))], dtype=dtype)
-    grad = gaussian_gradient(
-        centred_gaussian_projection,
-        torch.zeros(1, dtype=dtype),
-        scale,
-        samples.unsqueeze(-1),
-        log_weights,
-        sample_dim=0,
-    )
+    loc, samples = torch.zeros(1, dtype=dtype), samples.unsqueeze(-1)
+    grad = centred_gradient(loc, scale, samples, log_weights, sample_dim=0)
     assert all(value.isfinite().all() for value in grad)
 
 
@@ -1045,7 +1023,7 @@ def test_variance_of_the_centred_scale_is_unbiased(name):
     generator = torch.Generator().manual_seed(0)
     samples = torch.randn(len(weights), repetitions, 1, generator=generator, dtype=torch.float64)
     log_weights = weights.log().unsqueeze(-1).expand(-1, repetitions)
-    variance = sample_variance(centred_gaussian_projection, samples, log_weights)
+    variance = sample_variance(samples, log_weights)
     standard_error = variance.std() / math.sqrt(repetitions)
     assert (variance.mean() - 1).abs() < 4 * standard_error
     share = (weights / weights.sum()).square().sum()
@@ -1062,7 +1040,7 @@ def test_variance_of_a_lift_is_nearly_unbiased(slope, m, most):
     generator = torch.Generator().manual_seed(0)
     samples = torch.randn(m, 1_600_000 // m, 1, generator=generator, dtype=torch.float64)
     log_weights = slope * samples.squeeze(-1)
-    variance = sample_variance(centred_gaussian_projection, samples, log_weights)
+    variance = sample_variance(samples, log_weights)
     share = self_normalised_weights(log_weights, sample_dim=0).square().sum(0)
     bias = (variance.mean() - 1).item()
     assert abs(bias) < most
@@ -1136,7 +1114,7 @@ def test_surrogates_compile_without_a_graph_break(name, backend, tensor_temperat
 # ------------------------------------------------------------------------------------------ errors
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize("name", ["mean_seeking", *VALUES])
 @pytest.mark.parametrize(
     ("tau", "tau_prime", "message"),
     [
@@ -1148,14 +1126,18 @@ def test_surrogates_compile_without_a_graph_break(name, backend, tensor_temperat
     ],
 )
 def test_bad_temperatures_are_refused(name, tau, tau_prime, message):
-    """By each function that has them: UREX and MENT have tau, and MENT's may be 0."""
-    if name in ("urex", "ment") and not 0 < tau_prime < math.inf:
-        tau, message = tau_prime, message.replace("tau_prime", "tau").replace(r" \+ tau", "")
-    if name == "ment" and tau == 0:
-        assert evaluate(name, random_samples(4), tau).value.isfinite()
-        return
     with pytest.raises(ValueError, match=message):
-        evaluate(name, random_samples(4), tau, tau_prime)
+        FUNCTIONS[name](random_samples(4), tau, tau_prime)
+
+
+def test_urex_needs_a_temperature_and_ment_does_not():
+    x = random_samples(4)
+    for name, tau in itertools.product(("urex", "ment"), (-1.0, math.nan, math.inf)):
+        with pytest.raises(ValueError, match=f"tau must be a finite number >= 0, got {tau}"):
+            SURROGATES[name](x, tau, None)
+    with pytest.raises(ValueError, match="tau must be positive, got 0"):
+        SURROGATES["urex"](x, 0.0, None)
+    assert SURROGATES["ment"](x, 0.0, None).loss.isfinite()
 
 
 def test_check_temperatures():

@@ -93,12 +93,7 @@ def make_schedule(setting: float | Mapping[str, Any]) -> Schedule:
         setting: a number, which is held, or a mapping with ``schedule`` (``"constant"``,
             ``"linear"`` or ``"exponential"``) and that function's arguments.
 
-    Raises:
-        ValueError: for an unknown schedule or wrong arguments.
-
     Examples:
-        >>> make_schedule(0.5)(10)
-        0.5
         >>> make_schedule({"schedule": "linear", "start": 1.0, "end": 0.0, "duration": 20})(10)
         0.5
     """

@@ -218,15 +218,9 @@ def test_padded_junk_is_no_bad_input():
 @padding
 def test_delayed_reference_and_older_data(case, kind, padded):
     """With delay_actor the target is the reference, corrected for the policy that drew the data."""
-    behaviour, actor, reference = (make_actor(kind) for _ in range(3))
-    batch = sample(behaviour, 2, 3, 4)
-    batch = pad(batch) if padded else batch
-    move(actor, 0.1)
-    loss = case.build(actor, delay_actor=True)
-    loss.set_keys(**ACTOR_KEYS.get(kind, {}))
-    SoftUpdate(loss, eps=0.9)
+    loss, actor, batch = problem(case, kind, padded=padded, lag=0.1, delay_actor=True)
+    reference = make_actor(kind)
     move(reference, 0.1)
-    move(actor)
     assert_same(loss, actor, batch, expected_losses(case, actor, batch, reference))
 
 
