@@ -229,70 +229,58 @@ def test_effective_sample_size_by_hand(dtype, weights, expected):
     assert_close(effective_sample_size(vector(*weights, dtype=dtype)).item(), expected)
 
 
-class ByHand(NamedTuple):
-    """A function of log_prob in numbers: its weights, loss and gradient."""
-
-    function: Callable[[Tensor], Surrogate]
-    log_prob: Tensor
-    weights: Tensor
-    loss: float
-    gradient: Tensor
-
-
-def _by_hand(name: str, dtype: torch.dtype) -> ByHand:
-    def v(*values: float) -> Tensor:
-        return vector(*values, dtype=dtype)
-
-    log_prob, eighths, thirds = v(-1, -2, -3), v(1, 2, 5), v(1, 1, 1) / 3
-    if name == "mean_seeking":
-        return ByHand(
-            lambda x: mean_seeking_projection(x, eighths.log()),
-            *(log_prob, eighths / 8, (1 * 1 + 2 * 2 + 5 * 3) / 8, -eighths / 8),
-        )
-    if name == "mean_seeking_controlled":
-        control = log_prob - v(1, 1, 2).log()  # ratios 1/4, 1/4, 1/2
-        # Coefficients 1/8 - 2/8, 2/8 - 2/8, 5/8 - 4/8.
-        return ByHand(
-            lambda x: mean_seeking_projection(x, eighths.log(), control_log_prob=control),
-            *(log_prob, eighths / 8, -(-1 * -1 + 0 * -2 + 1 * -3) / 8, v(1 / 8, 0, -1 / 8)),
-        )
-    if name == "mode_seeking":
-        behaviour = log_prob - v(2, 1, 1).log()  # v = 1/2, 1/4, 1/4
-        reference = log_prob - v(1, 0, -1)
-        lift = v(2, 4, 3)  # A = 1, 4, 4; mean 5/2; v (A - mean) = -3/4, 3/8, 3/8
-        return ByHand(
-            lambda x: mode_seeking_projection(x, reference, lift, behaviour_log_prob=behaviour),
-            *(log_prob, v(1 / 2, 1 / 4, 1 / 4), -(3 / 4 - 3 / 4 - 9 / 8), v(3 / 4, -3 / 8, -3 / 8)),
-        )
-    if name == "urex":
-        # r / tau - log pi = 1, 1 + log 3, so w = 1/4, 3/4; S = 0 + 1/4, .5 log 1.5 + 3/4.
-        score = v(0, 0.5 * math.log(1.5))
-        quarter = (0.5 + 0.5 * math.log(1.5)) / 4  # half the distance to the mean, over K
-        return ByHand(
-            lambda x: urex_surrogate(x, score, tau=0.5),
-            *(v(-1, -1 - math.log(2)), v(1 / 4, 3 / 4), quarter * math.log(2)),
-            v(quarter, -quarter),
-        )
-    score = v(1, 2, 3)  # S = 2, 2.5, 4.5; mean 3
-    return ByHand(
-        lambda x: ment_surrogate(x, score, tau=0.5),
-        *(v(-2, -1, -3), thirds, -(-1 * -2 - 0.5 * -1 + 1.5 * -3) / 3, v(1 / 3, 1 / 6, -1 / 2)),
-    )
+QUARTER = (0.5 + 0.5 * math.log(1.5)) / 4
+THIRDS = (1 / 3, 1 / 3, 1 / 3)
+BY_HAND = {  # a function of log_prob x and of v, which makes vectors; x; weights, loss, gradient
+    "mean_seeking": (
+        lambda x, v: mean_seeking_projection(x, v(1, 2, 5).log()),
+        (-1, -2, -3),
+        ((1 / 8, 2 / 8, 5 / 8), (1 * 1 + 2 * 2 + 5 * 3) / 8, (-1 / 8, -2 / 8, -5 / 8)),
+    ),
+    # Ratios 1/4, 1/4, 1/2; coefficients 1/8 - 2/8, 2/8 - 2/8, 5/8 - 4/8.
+    "mean_seeking_controlled": (
+        lambda x, v: mean_seeking_projection(
+            x, v(1, 2, 5).log(), control_log_prob=v(-1, -2, -3) - v(1, 1, 2).log()
+        ),
+        (-1, -2, -3),
+        ((1 / 8, 2 / 8, 5 / 8), -(-1 * -1 + 0 * -2 + 1 * -3) / 8, (1 / 8, 0, -1 / 8)),
+    ),
+    # v = 1/2, 1/4, 1/4; A = 1, 4, 4; mean 5/2; v (A - mean) = -3/4, 3/8, 3/8.
+    "mode_seeking": (
+        lambda x, v: mode_seeking_projection(
+            x, v(-2, -2, -2), v(2, 4, 3), behaviour_log_prob=v(-1, -2, -3) - v(2, 1, 1).log()
+        ),
+        (-1, -2, -3),
+        ((1 / 2, 1 / 4, 1 / 4), -(3 / 4 - 3 / 4 - 9 / 8), (3 / 4, -3 / 8, -3 / 8)),
+    ),
+    # r / tau - log pi = 1, 1 + log 3, so w = 1/4, 3/4; S = 0 + 1/4, .5 log 1.5 + 3/4.
+    # QUARTER is half the distance to the mean, over K.
+    "urex": (
+        lambda x, v: urex_surrogate(x, v(0, 0.5 * math.log(1.5)), tau=0.5),
+        (-1, -1 - math.log(2)),
+        ((1 / 4, 3 / 4), QUARTER * math.log(2), (QUARTER, -QUARTER)),
+    ),
+    # S = 2, 2.5, 4.5; mean 3.
+    "ment": (
+        lambda x, v: ment_surrogate(x, v(1, 2, 3), tau=0.5),
+        (-2, -1, -3),
+        (THIRDS, -(-1 * -2 - 0.5 * -1 + 1.5 * -3) / 3, (1 / 3, 1 / 6, -1 / 2)),
+    ),
+}
 
 
 @DTYPES
-@pytest.mark.parametrize(
-    "name", ["mean_seeking", "mean_seeking_controlled", "mode_seeking", "urex", "ment"]
-)
+@pytest.mark.parametrize("name", BY_HAND)
 def test_surrogate_by_hand(name, dtype):
-    case = _by_hand(name, dtype)
+    v = functools.partial(vector, dtype=dtype)
+    function, log_prob, (weights, value, grad) = BY_HAND[name]
     # Three numbers near 1 are subtracted: some units in the last place of 1 are lost.
     tolerance = {"atol": 8 * torch.finfo(dtype).eps, "rtol": 8 * torch.finfo(dtype).eps}
-    loss, weights, *_ = case.function(case.log_prob)
-    assert_close(weights, case.weights, **tolerance)
-    assert_close(loss.item(), case.loss, **tolerance)
-    grad = gradient(lambda x: case.function(x).loss, case.log_prob)
-    assert_close(grad, case.gradient, **tolerance)
+    surrogate = function(v(*log_prob), v)
+    assert_close(surrogate.weights, v(*weights), **tolerance)
+    assert_close(surrogate.loss.item(), value, **tolerance)
+    actual = gradient(lambda x: function(x, v).loss, v(*log_prob))
+    assert_close(actual, v(*grad), **tolerance)
 
 
 def test_mode_seeking_projection_takes_the_reference_for_the_sampler_by_default():

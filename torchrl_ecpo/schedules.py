@@ -72,8 +72,7 @@ def theorem1_schedules(num_trajectories: int, *, horizon: int | None = None) -> 
 
     Args:
         num_trajectories: how many trajectories (actions of a bandit) there are.
-        horizon: total number of lifts for the constant choice; None (default) for the one that
-            changes with the number of the lift.
+        horizon: number of lifts, for the constant choice; None: a choice for each lift.
 
     Examples:
         >>> schedules = theorem1_schedules(10)

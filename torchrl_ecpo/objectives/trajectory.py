@@ -191,10 +191,10 @@ class TrajectoryGroupLoss(PolicyLoss):
 
     @abstractmethod
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
-        """The loss of each group ``[*G]``, and the weights it gave the trajectories ``[*G, K]``.
+        """The loss of each group ``[*G]``, and its trajectories' weights ``[*G, K]`` after a lift.
 
-        Without a lift the weights are None. Further losses and metrics, ``[*G]`` or 0-d, have the
-        names that :attr:`losses` and :attr:`metrics` declare.
+        Further losses and metrics, ``[*G]`` or 0-d, have the names that :attr:`losses` and
+        :attr:`metrics` declare.
         """
 
     @dispatch  # pyright: ignore[reportArgumentType] - it is typed for its other use, with arguments
@@ -210,9 +210,11 @@ class TrajectoryGroupLoss(PolicyLoss):
         """
         groups = self._read(tensordict)
         found = self.surrogate(groups)
-        of_weights = _of_weights(found.weights)
-        of_weights = {name: of_weights[name] for name in self.metrics if name in of_weights}
-        metrics = {**found.metrics, **of_weights}
+        metrics = dict(found.metrics)
+        if found.weights is not None:  # how evenly a lift weighs the trajectories
+            ess, largest = effective_sample_size(found.weights), found.weights.amax(-1)
+            of_weights = {"ESS": ess, "max_weight": largest}
+            metrics |= {name: of_weights[name] for name in OF_WEIGHTS if name in self.metrics}
         self._check_declared("losses", self.losses, found.losses)
         self._check_declared("metrics", self.metrics, metrics)
         metrics |= _of_groups(groups)
@@ -272,9 +274,6 @@ class TrajectoryGroupLoss(PolicyLoss):
 
         Instead of TensorDict's own hook, which takes a call for one with keywords if an entry of
         :attr:`in_keys` is absent: the mask and the states of a recurrent actor may be.
-
-        Raises:
-            ValueError: for a key that is not among the :attr:`out_keys`.
         """
         known = self._all_out_keys
         if not out_keys or not {*out_keys} <= {*known}:
@@ -292,16 +291,12 @@ class TrajectoryGroupLoss(PolicyLoss):
     def _read(self, tensordict: TensorDictBase) -> TrajectoryGroups:
         """Sum rewards and log-probabilities over the real steps of each trajectory."""
         steps = self._read_steps(tensordict)
-        reference = steps.reference_log_prob.sum(-1)
-        is_reference = steps.behaviour_log_prob is steps.reference_log_prob
-        groups = TrajectoryGroups(
-            returns=steps.rewards.sum(-1),
-            log_prob=steps.log_prob.sum(-1),
-            reference_log_prob=reference,
-            behaviour_log_prob=reference if is_reference else steps.behaviour_log_prob.sum(-1),
-            mask=None if steps.mask is None else steps.mask.any(-1),
-            steps=steps,
-        )
+        reference = behaviour = steps.reference_log_prob.sum(-1)
+        if steps.behaviour_log_prob is not steps.reference_log_prob:
+            behaviour = steps.behaviour_log_prob.sum(-1)
+        returns, log_prob = steps.rewards.sum(-1), steps.log_prob.sum(-1)
+        mask = None if steps.mask is None else steps.mask.any(-1)
+        groups = TrajectoryGroups(returns, log_prob, reference, behaviour, mask, steps)
         self._check_values(groups)
         return groups
 
@@ -562,13 +557,6 @@ def _last_real_step(step_mask: Tensor) -> tuple[Tensor, Tensor]:
     rows = torch.arange(step_mask.shape[0], device=step_mask.device)
     rows = rows.where(has_steps, has_steps.int().argmax())
     return rows.unsqueeze(-1).expand_as(columns), columns[rows]
-
-
-def _of_weights(weights: Tensor | None) -> dict[str, Tensor]:
-    """How evenly a lift weighs the trajectories, ``[*G]`` each."""
-    if weights is None:
-        return {}
-    return {"ESS": effective_sample_size(weights), "max_weight": weights.amax(-1)}
 
 
 def _of_groups(groups: TrajectoryGroups) -> dict[str, Tensor]:
