@@ -44,10 +44,7 @@ class Loss(LossModule):
 def test_values_at_start_half_end_and_after(schedule, expected):
     for each in (schedule, pickle.loads(pickle.dumps(schedule))):
         assert [each(count) for count in (0, 5, 10, 1_000)] == pytest.approx(expected, rel=1e-12)
-
-
-def test_linear_ends_at_exactly_its_end():
-    assert linear(0.05, 0.0, 3)(3) == 0.0
+        assert each(10) == expected[2]  # exactly
 
 
 @pytest.mark.parametrize("lift", [1, 2, 50])

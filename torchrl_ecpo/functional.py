@@ -8,31 +8,36 @@ Shapes
 Every function works along one axis of *samples*, ``sample_dim``: the K trajectories of a group, or
 the M actions drawn at a state (or all actions, where a sum is exact). ``E*`` stands for the shape
 that is left when this axis is taken out: any number of dimensions, also none. So ``[E*, K]`` is a
-tensor with the sample axis inserted at ``sample_dim`` and ``[E*]`` has one number per group.
-Nothing is averaged over ``E*``: the caller decides.
+tensor with the sample axis inserted at ``sample_dim`` and ``[E*]``, the shape of a result unless
+another is stated, has one number per group. Nothing is averaged over ``E*``: the caller decides.
 
 Symbols
 -------
 ==================== ================ =====================================================
 argument             symbol           meaning
 ==================== ================ =====================================================
-score                r(rho), Q(s, a)  what is to be maximised
-log_prob             log pi_theta     under the policy being trained; carries the gradient
-reference_log_prob   log pi_bar       under the reference policy, which is lifted
-behaviour_log_prob   log beta         under the policy that drew the samples
+score                r(rho), Q(s, a)  ``[E*, K]``, what is to be maximised
+log_prob             log pi_theta     ``[E*, K]``, under the policy being trained; carries the
+                                      gradient
+reference_log_prob   log pi_bar       ``[E*, K]``, under the reference policy, which is lifted
+behaviour_log_prob   log beta         ``[E*, K]``, under the policy that drew the samples
+log_weights          omega            ``[E*, K]``, of the target relative to the policy that drew
+                                      the samples, up to a constant
 tau                  tau >= 0         temperature of the divergence from the reference
 tau_prime            tau' >= 0        temperature of the entropy
 sample_dim                            the axis of the samples; the last by default
 mask                                  ``[E*, K]``, True where a sample is real (an action is
                                       allowed); None, the default: all are
+values, weights                       ``[E*, K]``; values may carry a gradient
+keepdim                               whether the sample axis stays, with length 1
 ==================== ================ =====================================================
 
 Where an argument is what the table says, its function does not say it again. Temperatures are
-floats or 0-d tensors, in the unit of the score. Floats are checked; tensors are taken as they are,
-so that nothing waits for a device. Finite input never gives NaN, as long as the temperatures are
-neither 0 nor infinite in the dtype of the scores (from 1e-37 to 1e38 in float32). Half precision is
-too narrow for sums over trajectories: give float32, as the losses do. A group in which all samples
-are masked has weights and a loss of 0, and no soft value.
+floats or 0-d tensors, in the unit of the score. Floats are checked (ValueError); tensors are taken
+as they are, so that nothing waits for a device. Finite input never gives NaN, as long as the
+temperatures are neither 0 nor infinite in the dtype of the scores (from 1e-37 to 1e38 in float32).
+Half precision is too narrow for sums over trajectories: give float32, as the losses do. A group in
+which all samples are masked has weights and a loss of 0, and no soft value.
 """
 
 from __future__ import annotations
@@ -99,13 +104,8 @@ class _Where(TypedDict):
 def check_temperatures(*, allow_zero: bool = False, **temperatures: float | Tensor) -> None:
     """Refuse temperatures for which a loss is not defined.
 
-    Args:
-        allow_zero: whether all may be 0 together.
-        temperatures: by name; each must be finite and at least 0, and, where there are any, one
-            above 0. Tensors are not looked at.
-
-    Raises:
-        ValueError: naming the temperature, what came, and the mend.
+    Each must be finite and at least 0, and one above 0, unless ``allow_zero``. Tensors are not
+    looked at.
 
     Examples:
         >>> check_temperatures(tau=0.5, tau_prime=0.01)
@@ -139,12 +139,8 @@ def lifted_log_weights(
         \omega = \frac{r(\rho) - \tau' \log \bar\pi(\rho)}{\tau + \tau'},
         \qquad \bar\pi^*_{\tau,\tau'}(\rho) \propto \bar\pi(\rho) \exp \omega .
 
-    Args:
-        score: ``[...]``, the return of a trajectory or the value of an action.
-        reference_log_prob: ``[...]``, log-probability under the reference policy, in nats.
-
     Returns:
-        ``[...]``, unnormalised. Add ``reference_log_prob`` for the lifted log-probability up to a
+        ``[E*, K]``, unnormalised. Add ``reference_log_prob`` for the lifted log-probability up to a
         constant (Eq. 5, 8); add ``reference_log_prob - behaviour_log_prob`` where another policy
         than the reference drew the samples.
 
@@ -166,11 +162,8 @@ def self_normalised_weights(
 
     .. math:: w_k = \frac{\exp \omega_k}{\sum_j \exp \omega_j}
 
-    Args:
-        log_weights: ``[E*, K]``.
-
     Returns:
-        ``[E*, K]``, summing to one; 0 where masked. A group without a real sample is all zeros.
+        ``[E*, K]``, summing to one; 0 where masked.
 
     Examples:
         >>> self_normalised_weights(torch.tensor([3.0, 1.0]).log())
@@ -190,12 +183,8 @@ def effective_sample_size(weights: Tensor, *, sample_dim: int = -1) -> Tensor:
 
     .. math:: \mathrm{ESS} = \frac{(\sum_k w_k)^2}{\sum_k w_k^2}
 
-    Args:
-        weights: ``[E*, K]``, non-negative, normalised or not.
-
-    Returns:
-        ``[E*]``, from 1 (one sample has all the weight) to K (all are equal); 0 for a group
-        without weight.
+    It is 1 where one sample has all the weight, K where all are equal, and 0 for a group without
+    weight. The weights are non-negative, normalised or not.
 
     Examples:
         1 / (0.75**2 + 0.25**2) = 1.6:
@@ -220,14 +209,8 @@ def lift_divergence_estimate(
     .. math::
         \mathrm{KL}(\bar\pi^*_{\tau,\tau'} \| \bar\pi) \approx \sum_m w_m \log (M w_m)
 
-    with w the self-normalised weights of the target. It cannot exceed log M, whatever the true
-    divergence is.
-
-    Args:
-        weights: ``[E*, M]``, :func:`self_normalised_weights` of samples that the reference drew.
-
-    Returns:
-        ``[E*]``, in nats, from 0 (equal weights) to log M (all weight on one sample).
+    with w the :func:`self_normalised_weights` of M samples that the reference drew. In nats, from 0
+    (equal weights) to log M (all weight on one sample), whatever the true divergence is.
 
     Examples:
         >>> lift_divergence_estimate(torch.tensor([[0.5, 0.5], [1.0, 0.0]])) / math.log(2)
@@ -250,10 +233,7 @@ def temperature_dual(log_temperature: Tensor, excess: Tensor) -> Tensor:
 
     Args:
         log_temperature: ``[]``; carries the gradient.
-        excess: ``[...]``; above 0 where the temperature is too low.
-
-    Returns:
-        ``[...]``.
+        excess: ``[...]``, the shape of the loss; above 0 where the temperature is too low.
 
     Examples:
         >>> log_tau = torch.tensor(0.5).log().requires_grad_()
@@ -279,10 +259,8 @@ def mean_seeking_projection(
         \qquad w = \mathrm{softmax}_k(\omega_k)
 
     Args:
-        log_prob: ``[E*, K]``, log-probability of each sample under the policy being trained.
-        log_weights: ``[E*, K]``, log importance weights of the target relative to the policy that
-            drew the samples: :func:`lifted_log_weights`, plus
-            ``reference_log_prob - behaviour_log_prob`` for data of another policy.
+        log_weights: :func:`lifted_log_weights`, plus ``reference_log_prob - behaviour_log_prob``
+            for data of another policy.
         control_log_prob: ``[E*, K]``, log-probability under the policy that drew the samples. If
             given, the self-normalised ratio softmax_k(log_prob - control_log_prob) is subtracted
             from each weight: a control variate whose expectation tends to zero, which removes the
@@ -306,9 +284,7 @@ def mean_seeking_projection(
     if control_log_prob is not None:
         log_ratio = _representable((log_prob - control_log_prob).detach())
         coefficients = weights - self_normalised_weights(log_ratio, **where)
-    return Surrogate(
-        -weighted_sum(coefficients, log_prob, sample_dim=sample_dim, mask=mask), weights
-    )
+    return Surrogate(-weighted_sum(coefficients, log_prob, **where), weights)
 
 
 def centred_gaussian_projection(
@@ -338,11 +314,10 @@ def centred_gaussian_projection(
         \frac{\partial L}{\partial \log \sigma} = 1 - \frac{S}{\sigma^2}, \qquad
         S = \frac{\sum_m w_m (u_m - m)^2}{1 - \sum_m w_m^2}
 
-    The gradient of the mean is the same, and so is the minimiser, as M grows: mean and variance of
-    the target. What changes is the way there: it is a block-coordinate step, in which the
-    scale goes where it would go if the mean had arrived, no longer gradient descent on Eq. 11.
-    The weights of a lift do depend on the samples, so that S is somewhat too small where M is: by
-    about 5 % at M = 8 for a lift that moves the mean by half a standard deviation.
+    The gradient of the mean is the same, and so is the minimiser, as M grows. The way there is a
+    block-coordinate step: the scale goes where it would go if the mean had arrived. The weights of
+    a lift do depend on the samples, so that S is too small by about 5 % at M = 8 for a lift that
+    moves the mean by half a standard deviation.
 
     Args:
         loc: ``[E*, A]``, mean of the policy being trained; carries the gradient.
@@ -350,14 +325,11 @@ def centred_gaussian_projection(
         samples: ``[E*, M, A]`` with the sample axis where ``sample_dim`` has it in the weights. Of
             a transformed Gaussian (tanh) they are the values before the transform, whose Jacobian
             does not depend on the policy.
-        log_weights: ``[E*, M]``, log-weight of the target relative to the distribution that drew
-            the samples, up to a constant per state.
         sample_dim: the axis of the M samples, in ``log_weights``.
 
     Returns:
-        :class:`Surrogate`: the loss ``[E*]`` in nats, a cross-entropy with the variance above, and
-        the weights. Where all weight is on one sample, there is no telling a width from it, and
-        the scale gets no gradient.
+        :class:`Surrogate`: the loss is a cross-entropy in nats, with the variance above. Where all
+        weight is on one sample, which tells no width, the scale gets no gradient.
 
     Examples:
         Two equal weights at 1 and 3: m = 2, S = 1 / (1 - 1/2) = 2.
@@ -382,8 +354,7 @@ def centred_gaussian_projection(
     log_scale = scale.log()
     distance = (mean - loc) / scale.detach()
     width = variance * (-2 * log_scale).exp()
-    loss = log_scale + 0.5 * (width + distance.square() + math.log(2 * math.pi))
-    loss = loss.sum(-1)
+    loss = (log_scale + 0.5 * (width + distance.square() + math.log(2 * math.pi))).sum(-1)
     if mask is not None:
         loss = loss.where(mask.any(dim), 0.0)
     return Surrogate(loss, weights)
@@ -413,12 +384,9 @@ def mode_seeking_projection(
     with the group's mean as baseline, divided by tau.
 
     Args:
-        log_prob: ``[E*, K]``, log-probability of each sample under the policy being trained.
-        reference_log_prob: ``[E*, K]``, under the reference policy.
-        log_weights: ``[E*, K]``, :func:`lifted_log_weights`: of the target relative to the
-            *reference*, whoever drew the samples.
-        behaviour_log_prob: ``[E*, K]``, under the policy that drew the samples; the reference by
-            default.
+        log_weights: :func:`lifted_log_weights`, of the target relative to the *reference*, whoever
+            drew the samples.
+        behaviour_log_prob: that of the reference by default.
 
     Returns:
         :class:`Surrogate`: a loss ``[E*]`` whose gradient estimates that of KL(pi, target), but
@@ -433,14 +401,12 @@ def mode_seeking_projection(
         >>> loss.backward(); v, log_prob.grad
         (tensor([0.5000, 0.5000]), tensor([-0.2500,  0.2500]))
     """
-    reference_log_prob, log_weights = reference_log_prob.detach(), log_weights.detach()
-    if behaviour_log_prob is None:
-        behaviour_log_prob = reference_log_prob
-    current, behaviour_log_prob = log_prob.detach(), behaviour_log_prob.detach()
-    log_ratio = _representable(current - behaviour_log_prob)
-    ratios = self_normalised_weights(log_ratio, sample_dim=sample_dim, mask=mask)
-    advantage = _representable(log_weights - _representable(current - reference_log_prob))
     where: _Where = {"sample_dim": sample_dim, "mask": mask}
+    current, reference_log_prob = log_prob.detach(), reference_log_prob.detach()
+    behaviour = reference_log_prob if behaviour_log_prob is None else behaviour_log_prob.detach()
+    ratios = self_normalised_weights(_representable(current - behaviour), **where)
+    distance = _representable(current - reference_log_prob)
+    advantage = _representable(log_weights.detach() - distance)
     advantage = advantage - weighted_sum(ratios, advantage, **where, keepdim=True)
     return Surrogate(-weighted_sum(ratios * advantage, log_prob, **where), ratios)
 
@@ -461,18 +427,7 @@ def urex_surrogate(
         w = \mathrm{softmax}_k(r_k / \tau - \log \pi_\theta(\rho_k))
 
     with S held constant and :math:`\bar S` its mean over the group. The samples are the current
-    policy's. The weights are ECPO's at tau = 0 and tau' = UREX's tau.
-
-    Args:
-        log_prob: ``[E*, K]``, log-probability of each sample under the policy being trained.
-        score: ``[E*, K]``.
-        tau: UREX's temperature; above 0.
-
-    Returns:
-        :class:`Surrogate`: its weights are w.
-
-    Raises:
-        ValueError: if ``tau`` is not above 0.
+    policy's. UREX's tau is above 0. The weights w are ECPO's at tau = 0 and tau' = UREX's tau.
 
     Examples:
         Equal log-probabilities and tau = 1/log 3 give w = (3/4, 1/4), S = (1 + 1.5 tau, 0.5 tau):
@@ -508,15 +463,8 @@ def ment_surrogate(
         L(\theta) = -\frac1K \sum_k (S_k - \bar S) \log \pi_\theta(\rho_k), \quad
         S_k = r_k - \tau \log \pi_\theta(\rho_k)
 
-    with S held constant. The samples are the current policy's.
-
-    Args:
-        log_prob: ``[E*, K]``, log-probability of each sample under the policy being trained.
-        score: ``[E*, K]``.
-        tau: temperature of the entropy; 0 is plain REINFORCE.
-
-    Returns:
-        :class:`Surrogate`: its weights are uniform.
+    with S held constant. The samples are the current policy's, and the weights uniform. Here tau is
+    the temperature of the entropy; 0 is plain REINFORCE.
 
     Examples:
         S = (1 + 0.5 * 1, 0 + 0.5 * 1), so S - mean = +-1/2 and the gradient -+1/4:
@@ -551,13 +499,8 @@ def soft_value(
         \bar V^*(s) = (\tau + \tau') \log \sum_a
             \exp \frac{\bar Q^*(s, a) + \tau \log \bar\pi(a|s)}{\tau + \tau'}
 
-    Args:
-        score: ``[E*, K]``, of each of the K actions there are.
-        reference_log_prob: ``[E*, K]``, under the reference policy.
-
-    Returns:
-        ``[E*]``, in the unit of the score, the maximum of
-        E score - tau KL(pi, pi_bar) + tau' H(pi) over all distributions pi.
+    In the unit of the score: the maximum of E score - tau KL(pi, pi_bar) + tau' H(pi) over all
+    distributions pi.
 
     Examples:
         Two equal actions, log pi_bar = -log 2: 1 + tau' log 2, their score and an entropy bonus.
@@ -589,15 +532,8 @@ def soft_value_estimate(
             \exp \frac{\bar Q^*(s, a_m) - \tau' \log \bar\pi(a_m|s)}{\tau + \tau'},
         \qquad a_m \sim \bar\pi(\cdot|s)
 
-    A lower bound in expectation (Jensen), consistent as M grows; with M = 1 it is the paper's
-    one-sample estimate Q - tau' log pi_bar (Eq. 9).
-
-    Args:
-        score: ``[E*, M]``.
-        reference_log_prob: ``[E*, M]``, under the reference policy, which drew the samples.
-
-    Returns:
-        ``[E*]``, in the unit of the score.
+    In the unit of the score. A lower bound in expectation (Jensen), consistent as M grows; with
+    M = 1 it is the paper's one-sample estimate Q - tau' log pi_bar (Eq. 9).
 
     Examples:
         One sample: 1 - 0.25 * -2 = 1.5.
@@ -625,23 +561,12 @@ def surrogate_reward(
             \exp \frac{r(\rho) + \tau \log \pi(\rho)}{\tau + \tau'}
 
     It is the :func:`soft_value` of the problem whose actions are whole trajectories, with pi as the
-    reference.
-
-    Args:
-        score: ``[E*, K]``, return of each of the K trajectories there are.
-        log_prob: ``[E*, K]``, under pi; may carry a gradient.
-
-    Returns:
-        ``[E*]``, in the unit of the return; from E r + tau' H(pi) (tau to infinity) to max r (both
-        to zero), Lemma 2.
+    reference: from E r + tau' H(pi) (tau to infinity) to max r (both to zero), Lemma 2.
 
     Examples:
-        >>> log_prob = torch.tensor([0.5, 0.5]).log()
-        >>> score = torch.tensor([1.0, 0.0])
+        >>> log_prob, score = torch.tensor([0.5, 0.5]).log(), torch.tensor([1.0, 0.0])
         >>> surrogate_reward(score, log_prob, tau=1e-3, tau_prime=0.0)  # near max r
         tensor(0.9993)
-        >>> surrogate_reward(score, log_prob, tau=1e3, tau_prime=0.0)  # near the mean
-        tensor(0.5001)
     """
     return soft_value(
         score, log_prob, tau=tau, tau_prime=tau_prime, sample_dim=sample_dim, mask=mask
@@ -657,25 +582,10 @@ def surrogate_reward_estimate(
     sample_dim: int = -1,
     mask: Tensor | None = None,
 ) -> Tensor:
-    r"""The surrogate reward SR (Eq. 7) from K trajectories of pi itself.
-
-    .. math::
-        \mathrm{SR}(\pi) \approx (\tau + \tau') \log \frac1K \sum_k
-            \exp \left( \frac{r(\rho_k) + \tau \log \pi(\rho_k)}{\tau + \tau'}
-            - \log \pi(\rho_k) \right), \qquad \rho_k \sim \pi
-
-    It is the :func:`soft_value_estimate` of the problem whose actions are whole trajectories.
-
-    Args:
-        score: ``[E*, K]``, return of each sampled trajectory.
-        log_prob: ``[E*, K]``, under pi, which drew them.
-
-    Returns:
-        ``[E*]``, in the unit of the return.
+    """The surrogate reward SR (Eq. 7) from K trajectories of pi: :func:`soft_value_estimate`.
 
     Examples:
-        >>> log_prob = torch.tensor([0.5, 0.5]).log()
-        >>> score = torch.tensor([1.0, 1.0])
+        >>> log_prob, score = torch.tensor([0.5, 0.5]).log(), torch.tensor([1.0, 1.0])
         >>> sr = surrogate_reward_estimate(score, log_prob, tau=0.5, tau_prime=0.25)
         >>> (sr - 1) / math.log(2)
         tensor(0.2500)
@@ -722,13 +632,10 @@ def theorem1_temperatures(horizon: float, num_trajectories: int) -> tuple[float,
 
 
 def uniform_weights(like: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None) -> Tensor:
-    """1/K for each of the K real samples of a group, 0 for the others.
+    """``[E*, K]``, 1/K for each of the K real samples of a group, 0 for the others.
 
     Args:
         like: ``[E*, K]``, whose shape, dtype and device the weights get.
-
-    Returns:
-        ``[E*, K]``.
 
     Examples:
         >>> uniform_weights(torch.rand(3), mask=torch.tensor([True, True, False]))
@@ -749,13 +656,7 @@ def weighted_sum(
 ) -> Tensor:
     """Sum of weights times values over the real samples, whatever stands in the masked ones.
 
-    Args:
-        weights: ``[E*, K]``; clipped where the sum would overflow, so that a gradient is left.
-        values: ``[E*, K]``; may carry a gradient.
-        keepdim: whether the sample axis stays, with length 1.
-
-    Returns:
-        ``[E*]``.
+    Weights are clipped where the sum would overflow, so that a gradient is left.
 
     Examples:
         >>> weights, values = torch.tensor([0.5, 0.5, 0.5]), torch.tensor([1.0, 3.0, math.nan])
@@ -773,14 +674,7 @@ def weighted_sum(
 def masked_mean(
     values: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None, keepdim: bool = False
 ) -> Tensor:
-    """Mean over the real samples of a group, whatever stands in the masked ones.
-
-    Args:
-        values: ``[E*, K]``; may carry a gradient.
-        keepdim: whether the sample axis stays, with length 1.
-
-    Returns:
-        ``[E*]``; 0 for a group without a real sample.
+    """Mean over the real samples, whatever stands in the masked ones; 0 where all are masked.
 
     Examples:
         >>> masked_mean(torch.tensor([1.0, 3.0, math.nan]), mask=torch.tensor([True, True, False]))
@@ -793,11 +687,7 @@ def masked_mean(
 def centred(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None) -> Tensor:
     """Scores less the mean of their group: REINFORCE's advantage with the group as baseline.
 
-    Args:
-        score: ``[E*, K]``.
-
-    Returns:
-        ``[E*, K]``, detached; 0 where masked.
+    ``[E*, K]``, detached; 0 where masked.
 
     Examples:
         >>> centred(torch.tensor([1.0, 2.0, 9.0]), mask=torch.tensor([True, True, False]))
@@ -812,9 +702,6 @@ def standardised(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = N
     r"""Centred scores in units of their group's standard deviation: GRPO's advantage.
 
     .. math:: A_k = \frac{r_k - \bar r}{\sqrt{\frac1K \sum_j (r_j - \bar r)^2}}
-
-    Args:
-        score: ``[E*, K]``.
 
     Returns:
         ``[E*, K]``, detached; 0 where masked, and in a group of equal scores (equal up to
@@ -847,11 +734,7 @@ def score_function_loss(
     .. math:: L(\theta) = -\frac1K \sum_k A_k \log \pi_\theta(\rho_k)
 
     Args:
-        log_prob: ``[E*, K]``, log-probability of each sample under the policy being trained.
         advantage: ``[E*, K]``, held constant: :func:`centred` or :func:`standardised` scores.
-
-    Returns:
-        ``[E*]``.
 
     Examples:
         >>> log_prob = torch.tensor([-1.0, -2.0], requires_grad=True)

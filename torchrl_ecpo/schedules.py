@@ -41,9 +41,6 @@ def constant(value: float) -> Schedule:
 def linear(start: float, end: float, duration: float) -> Schedule:
     """From ``start`` to ``end`` in a straight line over ``duration`` counts, then ``end``.
 
-    Raises:
-        ValueError: if ``duration`` is not positive.
-
     Examples:
         >>> tau_prime = linear(0.02, 0.0, 100)
         >>> [tau_prime(count) for count in (0, 50, 100, 200)]
@@ -54,10 +51,7 @@ def linear(start: float, end: float, duration: float) -> Schedule:
 
 
 def exponential(start: float, end: float, duration: float) -> Schedule:
-    """From ``start`` to ``end`` by a constant factor over ``duration`` counts, then ``end``.
-
-    Raises:
-        ValueError: if ``duration``, ``start`` or ``end`` is not positive.
+    """From ``start`` to ``end``, both above 0, by a constant factor over ``duration`` counts.
 
     Examples:
         >>> tau_prime = exponential(0.02, 0.0002, 100)
@@ -78,8 +72,7 @@ def theorem1_schedules(num_trajectories: int, *, horizon: int | None = None) -> 
 
     Args:
         num_trajectories: how many trajectories (actions of a bandit) there are.
-        horizon: total number of lifts for the constant choice; None (default) for the one that
-            changes with the number of the lift.
+        horizon: number of lifts, for the constant choice; None: a choice for each lift.
 
     Examples:
         >>> schedules = theorem1_schedules(10)
@@ -99,12 +92,7 @@ def make_schedule(setting: float | Mapping[str, Any]) -> Schedule:
         setting: a number, which is held, or a mapping with ``schedule`` (``"constant"``,
             ``"linear"`` or ``"exponential"``) and that function's arguments.
 
-    Raises:
-        ValueError: for an unknown schedule or wrong arguments.
-
     Examples:
-        >>> make_schedule(0.5)(10)
-        0.5
         >>> make_schedule({"schedule": "linear", "start": 1.0, "end": 0.0, "duration": 20})(10)
         0.5
     """

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 from torch.testing import assert_close
-from torchrl.objectives import HardUpdate
 from trajectory_problems import (
     CASES,
     gradients,
@@ -14,6 +13,7 @@ from trajectory_problems import (
     normalise,
     numbers,
     pad,
+    problem,
     reinforce,
     sample,
     split,
@@ -39,25 +39,6 @@ def test_defaults(loss_class, tau, tau_prime):
 
 
 # -------------------------------------------------------------------------------------------- ECPO
-
-
-def _first_step(group, actor):
-    """Eq. 6 at theta = reference: the weights need nothing but the policy itself."""
-    n = numbers(actor, group)
-    lift = (n.returns - CASE.temperatures["tau_prime"] * n.log_prob.detach()).div(
-        sum(CASE.temperatures.values())
-    )
-    return -(lift.softmax(0) * n.log_prob).sum()
-
-
-def test_single_step_projection():
-    """M = 1, the paper's "no projection": the gradient at the reference itself."""
-    actor = make_actor()
-    batch = pad(sample(actor, 2, 3, 4))
-    expected = torch.stack([_first_step(group, actor) for group in split(batch)]).mean()
-    value = CASE.build(actor)(batch)["loss_actor"]
-    assert_close(value, expected)
-    assert_close(gradients(value, actor), gradients(expected, actor))
 
 
 def test_weights_stay_while_the_policy_is_projected():
@@ -92,16 +73,10 @@ def test_projection_reaches_the_minimum_of_the_cross_entropy():
 @pytest.mark.parametrize("delayed", [False, True], ids=["recorded", "delayed"])
 def test_control_variate(delayed):
     """Each weight less the self-normalised ratio of the policy to the sampler."""
-    actor = make_actor()
-    batch = pad(sample(actor, 2, 3, 4))
-    reference = make_actor() if delayed else None
+    reference, lag = (make_actor(), 0.1) if delayed else (None, 0.0)
+    loss, actor, batch = problem(CASE, lag=lag, control_variate=True, delay_actor=delayed)
     if reference is not None:
-        move(actor, 0.1)
-        move(reference, 0.1)
-    loss = CASE.build(actor, control_variate=True, delay_actor=delayed)
-    if delayed:
-        HardUpdate(loss, value_network_update_interval=1)
-    move(actor)
+        move(reference, lag)
     expected = []
     for group in split(batch):
         n = numbers(actor, group, reference)
@@ -113,31 +88,25 @@ def test_control_variate(delayed):
     assert_close(gradients(value, actor), gradients(torch.stack(expected).mean(), actor))
 
 
-def test_control_variate_removes_the_drift_of_groups_without_preference():
-    """Equal returns, tau' = 0, theta = reference: no gradient at all; without it, a random one."""
-    actor = make_actor()
-    batch = sample(actor, 2, 3, 4)
-    batch["next", "reward"].zero_()
-    largest = {}
-    for control_variate in (False, True):
-        loss = ECPOLoss(actor, tau=0.5, tau_prime=0.0, control_variate=control_variate).double()
-        grads = gradients(loss(batch)["loss_actor"], actor)
-        largest[control_variate] = max(g.abs().max() for g in grads)
-    assert largest[False] > 1e-2
-    assert largest[True] < 1e-12
-
-
 # --------------------------------------------------------------------------------------------- PMD
 
 
-@pytest.mark.parametrize("tau", [0.1, 1.0, 10.0])
-def test_reinforce_at_the_reference(tau):
-    """At theta = reference, tau' = 0, for any tau: REINFORCE with the group's mean as baseline."""
+@pytest.mark.parametrize(
+    ("loss_class", "tau"), [(PMDLoss, 0.1), (PMDLoss, 1.0), (PMDLoss, 10.0), (MENTLoss, 0.0)]
+)
+def test_reinforce_at_the_reference(loss_class, tau):
+    """PMD at theta = reference, tau' = 0, for any tau; MENT without an entropy term.
+
+    The group's mean is the baseline, which a constant added to all returns does not change.
+    """
     actor = make_actor()
     batch = pad(sample(actor, 2, 3, 4))
     expected = torch.stack([reinforce(numbers(actor, group)) for group in split(batch)]).mean()
-    got = gradients(PMDLoss(actor, tau=tau).double()(batch)["loss_actor"], actor)
+    loss = loss_class(actor, tau=tau).double()
+    got = gradients(loss(batch)["loss_actor"], actor)
     assert_close(got, gradients(expected, actor))
+    batch["next", "reward"][..., 0, 0] += 5.0
+    assert_close(got, gradients(loss(batch)["loss_actor"], actor))
 
 
 def test_entropy_term_at_the_reference_is_ments():
@@ -195,18 +164,6 @@ def test_weights_are_under_the_policy_being_trained():
 # -------------------------------------------------------------------------------------------- MENT
 
 
-def test_tau_zero_is_reinforce():
-    """With the group's mean as baseline, which a constant added to all returns does not change."""
-    actor = make_actor()
-    batch = pad(sample(actor, 2, 3, 4))
-    loss = MENTLoss(actor, tau=0.0).double()
-    expected = torch.stack([reinforce(numbers(actor, group)) for group in split(batch)]).mean()
-    got = gradients(loss(batch)["loss_actor"], actor)
-    assert_close(got, gradients(expected, actor))
-    batch["next", "reward"][..., 0, 0] += 5.0
-    assert_close(got, gradients(loss(batch)["loss_actor"], actor))
-
-
 def test_entropy_alone():
     """Equal returns: improbable trajectories are made more probable."""
     actor = make_actor()
@@ -217,11 +174,3 @@ def test_entropy_alone():
     before["loss_actor"].backward()
     torch.optim.SGD(loss.parameters(), lr=1e-2).step()
     assert loss(batch)["entropy"] > before["entropy"]
-
-
-def test_weights_are_equal():
-    """All K trajectories count alike."""
-    actor = make_actor()
-    out = MENTLoss(actor).double()(sample(actor, 2, 3, 4))
-    assert_close(out["ESS"], torch.tensor(3.0).double())
-    assert_close(out["max_weight"], torch.tensor(1 / 3).double())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -28,6 +28,7 @@ from torchrl.modules import (
     TanhNormal,
     set_recurrent_mode,
 )
+from torchrl.objectives import HardUpdate
 
 from torchrl_ecpo.objectives import (
     ECPOLoss,
@@ -262,7 +263,6 @@ class Numbers:
     log_prob: Tensor
     reference: Tensor
     behaviour: Tensor
-    num_steps: Tensor
 
 
 def trajectory_log_prob(actor: ProbabilisticTensorDictSequential, trajectory: TensorDictBase):
@@ -287,13 +287,9 @@ def trajectory_log_prob(actor: ProbabilisticTensorDictSequential, trajectory: Te
 
 
 def recorded_log_prob(trajectory: TensorDictBase) -> Tensor:
-    """The sum of what the sampler wrote."""
-    log_prob = trajectory.get("action_log_prob", None)
-    if log_prob is not None:
-        return log_prob.sum()
-    if "write" in trajectory:
-        return (trajectory["move_log_prob"] + trajectory["write_log_prob"]).sum()
-    return (trajectory["action", "move_log_prob"] + trajectory["force_log_prob"]).sum()
+    """The sum of what the sampler wrote, over steps and over the parts of an action."""
+    entries = trajectory.flatten_keys().items()
+    return sum(value.sum() for key, value in entries if key.endswith("log_prob"))  # type: ignore
 
 
 def numbers(
@@ -314,7 +310,6 @@ def numbers(
         log_prob=torch.stack([trajectory_log_prob(actor, t) for t in group]),
         reference=references,
         behaviour=recorded,
-        num_steps=recorded.new_tensor([t.shape[1] for t in group]),
     )
 
 
@@ -366,11 +361,10 @@ class Case:
     loss: type[TrajectoryGroupLoss]
     temperatures: dict[str, float]
     formula: Callable[..., tuple[Tensor, Tensor]]
-    options: dict[str, Any] = field(default_factory=dict)
 
     def build(self, actor: nn.Module, **kwargs: Any) -> TrajectoryGroupLoss:
         """The loss, in the dtype of the actor, with temperatures exact in that dtype."""
-        loss = self.loss(actor, **self.temperatures, **self.options, **kwargs)  # type: ignore
+        loss = self.loss(actor, **self.temperatures, **kwargs)  # type: ignore
         loss.to(next(actor.parameters()).dtype)
         for name, value in self.temperatures.items():
             setattr(loss, name, value)
@@ -388,6 +382,34 @@ CASES = {
     "ment": Case(MENTLoss, {"tau": 0.4}, ment),
 }
 LIFTING = ("ecpo", "pmd")
+
+
+def problem(
+    case: Case,
+    kind: str = "categorical",
+    *,
+    padded: bool = True,
+    lag: float = 0.0,
+    **options: Any,
+) -> tuple[TrajectoryGroupLoss, Any, TensorDict]:
+    """A loss, its actor after some optimiser steps, and a batch ``[2, 3, 4]`` from before them.
+
+    With ``delay_actor`` the loss's reference is ``lag`` away from the policy that drew the batch.
+    """
+    actor = make_actor(kind)
+    batch = sample(actor, 2, 3, 4)
+    move(actor, lag)
+    loss = case.build(actor, **options)
+    loss.set_keys(**ACTOR_KEYS.get(kind, {}))
+    if loss.delay_actor:
+        HardUpdate(loss, value_network_update_interval=1)
+    move(actor)
+    return loss, actor, pad(batch) if padded else batch
+
+
+def expected_losses(case: Case, actor: Any, batch: TensorDictBase, *reference: Any) -> Tensor:
+    """The formula, one number for each group."""
+    return torch.stack([case.expected(actor, group, *reference)[0] for group in split(batch)])
 
 
 def gradients(value: Tensor, actor: nn.Module) -> list[Tensor]:

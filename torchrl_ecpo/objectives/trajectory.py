@@ -78,13 +78,10 @@ class TrajectoryGroupLoss(PolicyLoss):
     """Base class of the losses over groups of K trajectories of one problem instance.
 
     It reads a batch ``[*G, K, T]`` (any number of group dimensions, also none), sums rewards and
-    log-probabilities over the real steps of each trajectory, hands the numbers to
-    :meth:`surrogate`, and reduces and reports what comes back. A new member of the family
-    implements that one method, and declares in :attr:`losses` and :attr:`metrics` what else it
-    returns.
-
-    Returns, log-probabilities and what follows from them are in single precision at least, also
-    where the actor is in half precision or under autocast.
+    log-probabilities over the real steps of each trajectory, in single precision at least, hands
+    the numbers to :meth:`surrogate`, and reduces and reports what comes back. A new member of the
+    family implements that one method, and declares in :attr:`losses` and :attr:`metrics` what else
+    it returns.
 
     ``torch.compile(fullgraph=True)`` takes it with feed-forward actors; with recurrent ones PyTorch
     and TorchRL break the graph.
@@ -114,9 +111,8 @@ class TrajectoryGroupLoss(PolicyLoss):
     Raises:
         ValueError: for an unknown reduction or a temperature that is not allowed; when called, for
             a wrong shape, a group of one, also one that the mask leaves, a mask with a hole, a
-            reward or log-probability that is not finite. (Under ``torch.compile`` and
-            ``torch.vmap`` values are not looked at, only shapes: NaN then gives NaN, and a mask
-            without a real step gives 0.)
+            reward or log-probability that is not finite. (``torch.compile`` and ``torch.vmap``
+            look at shapes only: NaN then gives NaN, and a mask without a real step gives 0.)
         TypeError: if ``actor_network`` has no ``get_dist``.
         KeyError: when called, for a missing entry.
 
@@ -147,8 +143,8 @@ class TrajectoryGroupLoss(PolicyLoss):
         """Entries of the input tensordict, all of leading shape ``[*G, K, T]``.
 
         Attributes:
-            action: what was done; a list of keys for a composite action. Defaults to ``"action"``.
-            reward: ``[*G, K, T, 1]``, read from ``"next"``. Defaults to ``"reward"``.
+            action: what was done; a list of keys for a composite action.
+            reward: ``[*G, K, T, 1]``, read from ``"next"``.
             sample_log_prob: log-probability of the action under the policy that drew it,
                 ``[*G, K, T]``; a list of keys is added up. Defaults to ``"action_log_prob"``, or
                 to ``"sample_log_prob"`` if ``composite_lp_aggregate()`` is True, as in TorchRL.
@@ -195,10 +191,10 @@ class TrajectoryGroupLoss(PolicyLoss):
 
     @abstractmethod
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
-        """The loss of each group ``[*G]``, and the weights it gave the trajectories ``[*G, K]``.
+        """The loss of each group ``[*G]``, and its trajectories' weights ``[*G, K]`` after a lift.
 
-        Without a lift the weights are None. Further losses and metrics, ``[*G]`` or 0-d, have the
-        names that :attr:`losses` and :attr:`metrics` declare.
+        Further losses and metrics, ``[*G]`` or 0-d, have the names that :attr:`losses` and
+        :attr:`metrics` declare.
         """
 
     @dispatch  # pyright: ignore[reportArgumentType] - it is typed for its other use, with arguments
@@ -213,23 +209,22 @@ class TrajectoryGroupLoss(PolicyLoss):
             or one number a group (``[*G]``) with ``reduction="none"``.
         """
         groups = self._read(tensordict)
-        surrogate = self.surrogate(groups)
-        of_weights = _of_weights(surrogate.weights)
-        losses = {"loss_actor": surrogate.loss, **surrogate.losses}
-        metrics = {
-            **surrogate.metrics,
-            **{k: v for k, v in of_weights.items() if k in self.metrics},
-        }
-        self._check_declared("losses", self.losses, surrogate.losses)
+        found = self.surrogate(groups)
+        metrics = dict(found.metrics)
+        if found.weights is not None:  # how evenly a lift weighs the trajectories
+            ess, largest = effective_sample_size(found.weights), found.weights.amax(-1)
+            of_weights = {"ESS": ess, "max_weight": largest}
+            metrics |= {name: of_weights[name] for name in OF_WEIGHTS if name in self.metrics}
+        self._check_declared("losses", self.losses, found.losses)
         self._check_declared("metrics", self.metrics, metrics)
         metrics |= _of_groups(groups)
-        dtype, reduction = surrogate.loss.dtype, self.reduction
-        shape = surrogate.loss.shape if reduction == "none" else torch.Size([])
-        metrics = {name: value.detach().to(dtype) for name, value in metrics.items()}
-        if reduction == "none":
+        metrics = {k: v.detach().to(found.loss.dtype) for k, v in metrics.items()}
+        losses = {"loss_actor": found.loss, **found.losses}
+        if self.reduction == "none":
+            shape = found.loss.shape
             outputs: dict[Any, Tensor] = {k: v.expand(shape) for k, v in (losses | metrics).items()}
         else:
-            reduce = torch.sum if reduction == "sum" else torch.mean
+            shape, reduce = torch.Size([]), torch.sum if self.reduction == "sum" else torch.mean
             outputs = {name: reduce(loss) for name, loss in losses.items()}
             outputs |= {name: value.mean() for name, value in metrics.items()}
         return TensorDict({key: outputs[key] for key in self.out_keys}, batch_size=shape)
@@ -279,9 +274,6 @@ class TrajectoryGroupLoss(PolicyLoss):
 
         Instead of TensorDict's own hook, which takes a call for one with keywords if an entry of
         :attr:`in_keys` is absent: the mask and the states of a recurrent actor may be.
-
-        Raises:
-            ValueError: for a key that is not among the :attr:`out_keys`.
         """
         known = self._all_out_keys
         if not out_keys or not {*out_keys} <= {*known}:
@@ -299,16 +291,12 @@ class TrajectoryGroupLoss(PolicyLoss):
     def _read(self, tensordict: TensorDictBase) -> TrajectoryGroups:
         """Sum rewards and log-probabilities over the real steps of each trajectory."""
         steps = self._read_steps(tensordict)
-        reference = steps.reference_log_prob.sum(-1)
-        is_reference = steps.behaviour_log_prob is steps.reference_log_prob
-        groups = TrajectoryGroups(
-            returns=steps.rewards.sum(-1),
-            log_prob=steps.log_prob.sum(-1),
-            reference_log_prob=reference,
-            behaviour_log_prob=reference if is_reference else steps.behaviour_log_prob.sum(-1),
-            mask=None if steps.mask is None else steps.mask.any(-1),
-            steps=steps,
-        )
+        reference = behaviour = steps.reference_log_prob.sum(-1)
+        if steps.behaviour_log_prob is not steps.reference_log_prob:
+            behaviour = steps.behaviour_log_prob.sum(-1)
+        returns, log_prob = steps.rewards.sum(-1), steps.log_prob.sum(-1)
+        mask = None if steps.mask is None else steps.mask.any(-1)
+        groups = TrajectoryGroups(returns, log_prob, reference, behaviour, mask, steps)
         self._check_values(groups)
         return groups
 
@@ -332,15 +320,18 @@ class TrajectoryGroupLoss(PolicyLoss):
             with torch.no_grad():
                 reference = real(self._log_prob(inputs, self.target_actor_network_params, shape))
             behaviour = reference if recorded is None else real(recorded)
+        elif recorded is not None:
+            reference = behaviour = real(recorded)
         else:
-            reference = behaviour = real(self._demanded(recorded))
-        return Steps(
-            rewards=real(reward.squeeze(-1).to(log_prob.dtype)),
-            log_prob=log_prob,
-            reference_log_prob=reference,
-            behaviour_log_prob=behaviour,
-            mask=mask,
-        )
+            raise KeyError(
+                f"The entry {self.tensor_keys.sample_log_prob!r} is missing: the log-probability "
+                "of each action under the policy that drew it. Build the actor with "
+                "return_log_prob=True, or name the entry with set_keys(sample_log_prob=...); the "
+                "lift-and-project losses can also be built with delay_actor=True and evaluate a "
+                "reference policy of their own."
+            )
+        rewards = real(reward.squeeze(-1).to(log_prob.dtype))
+        return Steps(rewards, log_prob, reference, behaviour, mask)
 
     def _actor_inputs(
         self, tensordict: TensorDictBase, shape: torch.Size, step_mask: Tensor | None
@@ -413,16 +404,14 @@ class TrajectoryGroupLoss(PolicyLoss):
     ) -> Tensor:
         """Log-probability ``[N, T]`` of recorded actions, under one distribution."""
         if isinstance(dist, CompositeDistribution):
-            log_prob = dist.log_prob(inputs.select(*action_keys))
+            log_prob = _sum_parts(dist.log_prob(inputs.select(*action_keys)))
         elif len(action_keys) == 1:
-            log_prob = dist.log_prob(inputs.get(action_keys[0]))
+            log_prob = _sum_parts(dist.log_prob(inputs.get(action_keys[0])))
         else:
             raise ValueError(
                 f"The action has several parts {action_keys}, but the actor's distribution is a "
                 f"{type(dist).__name__}, which has one. Name it with set_keys(action=...)."
             )
-        if is_tensor_collection(log_prob):
-            log_prob = _sum_parts(log_prob)
         if log_prob.shape != inputs.shape:
             raise ValueError(
                 f"The actor's distribution {type(dist).__name__} gives log-probabilities of shape "
@@ -434,13 +423,12 @@ class TrajectoryGroupLoss(PolicyLoss):
 
     def _recorded_log_prob(self, tensordict: TensorDictBase, shape: torch.Size) -> Tensor | None:
         """Log-probability ``[*G, K, T]`` under the policy that drew the actions, if it is there."""
-        total, keys = None, _as_list(self.tensor_keys.sample_log_prob)
+        keys = _as_list(self.tensor_keys.sample_log_prob)
         if all(tensordict.get(key, None) is None for key in keys):
             return None
+        total = torch.zeros(())
         for key in keys:
-            value: Any = get_entry(tensordict, key)
-            if is_tensor_collection(value):
-                value = _sum_parts(value)
+            value = _sum_parts(get_entry(tensordict, key))
             if value.shape != shape:
                 raise ValueError(
                     f"The log-probability {key!r} must have the shape [*G, K, T] = {tuple(shape)}, "
@@ -448,19 +436,8 @@ class TrajectoryGroupLoss(PolicyLoss):
                     "number for each step, without a trailing dimension. Squeeze it, or sum it "
                     "over the parts of the action."
                 )
-            total = value if total is None else total + value
-        return None if total is None else total.detach()
-
-    def _demanded(self, recorded: Tensor | None) -> Tensor:
-        if recorded is None:
-            raise KeyError(
-                f"The entry {self.tensor_keys.sample_log_prob!r} is missing: the log-probability "
-                "of each action under the policy that drew it. Build the actor with "
-                "return_log_prob=True, or name the entry with set_keys(sample_log_prob=...); the "
-                "lift-and-project losses can also be built with delay_actor=True and evaluate a "
-                "reference policy of their own."
-            )
-        return recorded
+            total = total + value.detach()
+        return total
 
     def _check_values(self, groups: TrajectoryGroups) -> None:
         """Refuse values that would silently spoil a whole group. One look; none when compiled."""
@@ -476,9 +453,9 @@ class TrajectoryGroupLoss(PolicyLoss):
             del quantities[f"entry {self.tensor_keys.sample_log_prob!r}"]  # it is not there
         finite = torch.stack(list(quantities.values())).isfinite()
         is_group = finite.new_ones(()) if groups.mask is None else groups.mask.sum(-1) >= 2
-        if bool((finite.all() & is_group.all()).item()):
+        if bool(finite.all() & is_group.all()):
             return
-        if not bool(is_group.all().item()):
+        if not is_group.all():
             raise ValueError(
                 f"The mask ({self.mask_keys}) leaves {int((~is_group).sum())} group(s) "
                 "with fewer than two trajectories that have a real step: weights are relative to "
@@ -547,8 +524,10 @@ def _as_list(keys: NestedKey | list[NestedKey] | None) -> list[NestedKey]:
     return list(keys) if isinstance(keys, list) else [keys]  # type: ignore[list-item]
 
 
-def _sum_parts(log_prob: TensorDictBase) -> Tensor:
-    """Log-probability of a composite action from those of its independent parts."""
+def _sum_parts(log_prob: Any) -> Tensor:
+    """Log-probability of an action, from those of its independent parts if it is composite."""
+    if not is_tensor_collection(log_prob):
+        return log_prob
     return torch.stack(list(log_prob.values(True, True))).sum(0)
 
 
@@ -578,13 +557,6 @@ def _last_real_step(step_mask: Tensor) -> tuple[Tensor, Tensor]:
     rows = torch.arange(step_mask.shape[0], device=step_mask.device)
     rows = rows.where(has_steps, has_steps.int().argmax())
     return rows.unsqueeze(-1).expand_as(columns), columns[rows]
-
-
-def _of_weights(weights: Tensor | None) -> dict[str, Tensor]:
-    """How evenly a lift weighs the trajectories, ``[*G]`` each."""
-    if weights is None:
-        return {}
-    return {"ESS": effective_sample_size(weights), "max_weight": weights.amax(-1)}
 
 
 def _of_groups(groups: TrajectoryGroups) -> dict[str, Tensor]:
