@@ -375,6 +375,7 @@ def test_ctrl_c_and_resume_auto_as_a_user_types_them(tmp_path):
     command += ["total_trajectories=2000000"]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
         while not list(tmp_path.glob("runs/*/*/*/*/metrics.csv")):
+            assert process.poll() is None, "the run has ended before its first record"
             time.sleep(0.05)
         process.send_signal(signal.SIGINT)
         assert process.stdout is not None
