@@ -310,16 +310,6 @@ def test_a_stack_is_made_continued_and_collected(study, run, tmp_path):
     assert float(row["seconds"]) == pytest.approx(summary["seconds"] / 2, abs=0.06)
 
 
-def test_a_run_that_two_studies_ask_for_is_made_once_and_as_long_as_the_longer(
-    run, tmp_path, counter
-):
-    path = plan(tmp_path, counter, s={"seeds": "1"}, t={"seeds": "1", "steps": 6})
-    assert run(path)[0] == 0
-    (directory,) = (tmp_path / "runs/one").rglob("seed_1")
-    assert json.loads((directory / "summary.json").read_text())["frames"] == 6
-    assert len(starts(tmp_path / "runs")) == 1
-
-
 @pytest.mark.parametrize("has_buffer", [False, True])
 def test_with_more_steps_a_run_goes_on_unless_it_has_left_out_a_buffer(
     run, tmp_path, counter, has_buffer
@@ -509,13 +499,19 @@ def test_a_strange_directory_keeps_no_other_run_out(study, run, tmp_path, counte
     assert [key[-1] for key in results.curves] == [3]
 
 
-def test_a_study_is_made_seed_by_seed(study, tmp_path, counter):
+def test_studies_are_made_seed_by_seed_and_what_two_ask_for_once(study, tmp_path, counter):
     methods = {"A": "speed=1.0", "B": "speed=2.0"}
-    path = plan(tmp_path, counter, s={"methods": methods}, t={"seeds": "11-12"})
+    longer = {"seeds": "1,11", "steps": 6}
+    path = plan(tmp_path, counter, s={"methods": methods}, t={"seeds": "11-12"}, u=longer)
     cells = study.manifest.read_manifests([path]).select()
     runs = study.run.planned_runs(cells, tmp_path / "runs")
-    assert [str(run).removeprefix("one/") for run in runs] == [
-        *("A/seed 1", "B/seed 1", "A/seed 2", "B/seed 2", "A/seed 11", "A/seed 12"),
+    assert [(str(run).removeprefix("one/"), run.command[-3]) for run in runs] == [
+        ("A/seed 1", "total_frames=6"),
+        ("B/seed 1", "total_frames=4"),
+        ("A/seed 2", "total_frames=4"),
+        ("B/seed 2", "total_frames=4"),
+        ("A/seed 11", "total_frames=6"),
+        ("A/seed 12", "total_frames=4"),
     ]
 
 
