@@ -27,6 +27,7 @@ from torchrl_ecpo.envs import EpisodeReplay
 from torchrl_ecpo.experiment import Checkpoints
 from torchrl_ecpo.experiment.checkpoint import run_directory
 
+SCRIPT_MODULES = ("utils", "tasks", "stack", "score_sac", "ecpo", "ecac")
 SCRIPTS = Path(__file__).parents[1] / "sota-implementations"
 BANDIT = ("ecpo", "env=bandit", "env.num_actions=20", "total_trajectories=60", "group_size=5")
 ALGORITHMIC = ("num_groups=2", "group_size=8", "env.hidden_size=8", "evaluation_interval=2")
@@ -63,7 +64,7 @@ def start(monkeypatch):
     monkeypatch.setattr("torchrl_ecpo.experiment.run.plot_learning_curve", lambda *_, **__: "")
 
     def start(directory, script, *options, stop_at=None, kill_at=None, save_at=None):
-        for name in ("utils", "tasks", "stack", "score_sac", script):
+        for name in SCRIPT_MODULES:
             sys.modules.pop(name, None)
         monkeypatch.syspath_prepend(str(SCRIPTS / script))
         main = importlib.import_module(script).main
@@ -89,7 +90,7 @@ def start(monkeypatch):
             main.__wrapped__(config)
 
     yield start
-    for name in ("utils", "tasks", "stack", "score_sac", "ecpo", "ecac"):
+    for name in SCRIPT_MODULES:
         sys.modules.pop(name, None)
 
 
@@ -214,21 +215,17 @@ def test_what_cannot_be_resumed_is_refused(interrupted, start, spoil, options, m
         assert len(record(interrupted)) == 6
 
 
-def test_a_new_run_in_an_old_directory_forgets_the_old_one(interrupted, start):
+@pytest.mark.parametrize("save_at", [None, 1])
+def test_a_new_run_in_an_old_directory_forgets_the_old_one(interrupted, start, capfd, save_at):
+    """One that is killed before its first checkpoint is begun again."""
     with pytest.raises(Killed):
-        start(interrupted, *RUNS["bandit"], "seed=8", save_at=1, kill_at=2)
-    assert [path.name[-2:] for path in checkpoints(interrupted)] == ["05"]
+        start(interrupted, *RUNS["bandit"], "seed=8", save_at=save_at, kill_at=2)
+    folder = interrupted / "checkpoints"
+    kept = [path.name[-2:] for path in folder.iterdir()] if folder.exists() else []
+    assert kept == (["05"] if save_at else [])
     start(interrupted, *RUNS["bandit"], "seed=8", "resume=auto")
-    start(interrupted / "whole", *RUNS["bandit"], "seed=8")
-    assert_same_run(interrupted, interrupted / "whole")
-
-
-def test_a_new_run_that_is_killed_at_once_can_be_begun_again(interrupted, start, capfd):
-    with pytest.raises(Killed):
-        start(interrupted, *RUNS["bandit"], "seed=8", kill_at=1)
-    assert not (interrupted / "checkpoints").exists()
-    start(interrupted, *RUNS["bandit"], "seed=8", "resume=auto")
-    assert "resume=auto found no checkpoint: a new run begins" in capfd.readouterr().out
+    begins = "resume=auto found no checkpoint: a new run begins" in capfd.readouterr().out
+    assert begins is (save_at is None)
     start(interrupted / "whole", *RUNS["bandit"], "seed=8")
     assert_same_run(interrupted, interrupted / "whole")
 
@@ -317,22 +314,21 @@ def test_writing_takes_a_bounded_share_of_the_time(tmp_path, start, monkeypatch)
 
 
 @pytest.mark.parametrize(
-    "make",
-    [
-        lambda: GymEnv("Pendulum-v1"),
-        lambda: GymEnv("CartPole-v1"),
-        lambda: GymEnv("Hopper-v5"),
-        lambda: GymEnv("Humanoid-v5"),
-        lambda: DMControlEnv("reacher", "easy"),
-    ],
-    ids=["pendulum", "cartpole", "hopper", "humanoid", "reacher"],
+    "task",
+    ["Pendulum-v1", "CartPole-v1", "Hopper-v5", "Humanoid-v5", ("reacher", "easy")],
+    ids=str,
 )
-def test_a_simulator_goes_on_where_it_was(make):
+def test_a_simulator_goes_on_where_it_was(task):
     pytest.importorskip("mujoco")
-    env, other = (TransformedEnv(make(), EpisodeReplay()) for _ in range(2))
+
+    def make():
+        env = GymEnv(task) if isinstance(task, str) else DMControlEnv(*task)
+        return TransformedEnv(env, EpisodeReplay())
+
+    env, other = make(), make()
     other.set_seed(1)
     other.load_state_dict(env.state_dict())  # before the first episode
-    assert_same_steps(env.reset(), other.reset())
+    assert (env.reset() == other.reset()).all()
     state = env.reset()
     for _ in range(40):
         _, state = env.step_and_maybe_reset(env.rand_action(state))
@@ -345,12 +341,8 @@ def test_a_simulator_goes_on_where_it_was(make):
         again["action"] = env.rand_action(state)["action"].clone()
         step, state = env.step_and_maybe_reset(state)
         step_again, again = other.step_and_maybe_reset(again)
-        assert_same_steps(step, step_again)
-        assert_same_steps(state, again)
-
-
-def assert_same_steps(one, other):
-    assert (one == other).all()
+        assert (step == step_again).all()
+        assert (state == again).all()
 
 
 @pytest.mark.parametrize(

@@ -167,12 +167,6 @@ def utils(monkeypatch):
         sys.modules.pop(name, None)
 
 
-def test_an_unknown_task_is_refused_before_anything_starts(tmp_path):
-    process = start(tmp_path, "env=chess")
-    assert process.returncode != 0
-    assert "Could not find 'env/chess'" in process.stderr
-
-
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
@@ -205,9 +199,7 @@ def test_a_missing_simulator_is_named_with_its_extra(utils, monkeypatch):
         raise gym.error.DependencyNotInstalled("No mujoco.")
 
     monkeypatch.setattr(utils, "GymEnv", fail)
-    config = OmegaConf.create(
-        {"env": {"kind": "gym", "name": "Ant-v5"}, "evaluation": {"video": 0}}
-    )
+    config = configure(["env=gym", "env.name=Ant-v5"])
     with pytest.raises(ModuleNotFoundError, match=r"Ant-v5 .* pip install '\.\[mujoco\]'"):
         utils.make_environment(config, seed=0)
 
@@ -232,8 +224,7 @@ def test_a_video_of_the_first_episode_is_saved(utils, tmp_path, monkeypatch):
 def test_time_limits_are_truncations(utils, name, ends_early):
     if name == "Hopper-v5":
         pytest.importorskip("mujoco")
-    env = {"kind": "gym", "name": name}
-    config = OmegaConf.create({"env": env, "evaluation": {"video": False}})
+    config = configure(["env=gym", f"env.name={name}"])
     last = utils.make_environment(config, seed=0).rollout(1000)[-1]["next"]
     assert last["done"].item()
     assert last["terminated"].item() is ends_early
@@ -241,36 +232,37 @@ def test_time_limits_are_truncations(utils, name, ends_early):
     assert last["observation"].dtype == torch.float32
 
 
+@pytest.fixture
+def build(utils):
+    """Builds environment, actor and loss (with its updater), always with the same weights."""
+
+    def build(*overrides):
+        torch.manual_seed(0)
+        config = configure(["hidden_sizes=[16,16]", *overrides])
+        env = utils.make_environment(config, seed=0)
+        actor = utils.make_actor(config, env)
+        loss_module = utils.make_loss(config, actor, env)
+        utils.make_updater(config, loss_module)
+        return config, actor, loss_module
+
+    return build
+
+
 def random_transitions():
     """256 of Pendulum's, none of which ends an episode."""
     never = torch.zeros(256, 1, dtype=torch.bool)
     torch.manual_seed(0)
-    return TensorDict(
-        {
-            "observation": torch.randn(256, 3),
-            "action": torch.rand(256, 1),
-            "next": {
-                "observation": torch.randn(256, 3),
-                "reward": torch.randn(256, 1),
-                "done": never,
-                "terminated": never,
-            },
-        },
-        [256],
-    )
+    following = {"observation": torch.randn(256, 3), "reward": torch.randn(256, 1)}
+    following |= {"done": never, "terminated": never}
+    now = {"observation": torch.randn(256, 3), "action": torch.rand(256, 1)}
+    return TensorDict(now | {"next": following}, [256])
 
 
 @pytest.mark.parametrize("loss", ["ecac", "pmd_ac"])
-def test_the_way_q_networks_are_called_changes_no_number(utils, monkeypatch, loss):
-    config = configure(["hidden_sizes=[48,48]", f"loss={loss}"])
-    env = utils.make_environment(config, seed=0)
-    batch = random_transitions()
-
+def test_the_way_q_networks_are_called_changes_no_number(build, monkeypatch, loss):
     def losses_and_gradients():
-        torch.manual_seed(0)
-        loss_module = utils.make_loss(config, utils.make_actor(config, env), env)
-        utils.make_updater(config, loss_module)
-        losses = loss_module(batch.copy())
+        _, _, loss_module = build("hidden_sizes=[48,48]", f"loss={loss}")
+        losses = loss_module(random_transitions())
         sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
         return losses.detach().to_dict(), [each.grad for each in loss_module.parameters()]
 
@@ -279,20 +271,13 @@ def test_the_way_q_networks_are_called_changes_no_number(utils, monkeypatch, los
     torch.testing.assert_close(ours, losses_and_gradients())
 
 
-def test_an_update_that_leaves_the_policy_is_the_same_for_q(utils):
-    config = configure(["hidden_sizes=[16,16]", "loss=td3"])
-    env = utils.make_environment(config, seed=0)
-    batch = random_transitions()
-    loss_module = utils.make_loss(config, utils.make_actor(config, env), env)
-    utils.make_updater(config, loss_module)
-
+def test_an_update_that_leaves_the_policy_is_the_same_for_q(utils, build):
     def loss_of_q_and_gradients(*, with_policy):
-        torch.manual_seed(0)
-        losses = utils.compute_losses(loss_module, batch.copy(), with_policy)
+        _, _, loss_module = build("loss=td3")
+        losses = utils.compute_losses(loss_module, random_transitions(), with_policy)
         assert ("loss_actor" in losses) is with_policy
         losses["loss_qvalue"].backward()
         gradients = [parameter.grad for parameter in loss_module.qvalue_network_params.parameters()]
-        loss_module.zero_grad()
         return losses["loss_qvalue"].detach(), gradients
 
     whole = loss_of_q_and_gradients(with_policy=True)
@@ -300,18 +285,12 @@ def test_an_update_that_leaves_the_policy_is_the_same_for_q(utils):
 
 
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
-def test_a_compiled_update_that_leaves_the_policy_leaves_it(utils):
+def test_a_compiled_update_that_leaves_the_policy_leaves_it(utils, build):
     """As inductor does, this backend gives gradients of 0 where eagerly there are none."""
     from ecac import descend, total
 
-    config = configure(["hidden_sizes=[16,16]", "loss=td3"])
-    env = utils.make_environment(config, seed=0)
-
     def weights(*, is_compiled):
-        torch.manual_seed(0)
-        actor = utils.make_actor(config, env)
-        loss_module = utils.make_loss(config, actor, env)
-        utils.make_updater(config, loss_module)
+        config, actor, loss_module = build("loss=td3")
         optimizer = utils.make_optimizer(config.loss.lr, loss_module)
         if is_compiled:
             torch._dynamo.reset()
@@ -329,10 +308,8 @@ def test_a_compiled_update_that_leaves_the_policy_leaves_it(utils):
     torch.testing.assert_close(weights(is_compiled=True), policies, atol=1e-4, rtol=1e-4)
 
 
-def test_adam_has_a_group_for_each_learning_rate(utils):
-    config = configure(["hidden_sizes=[16,16]"])
-    env = utils.make_environment(config, seed=0)
-    loss_module = utils.make_loss(config, utils.make_actor(config, env), env)
+def test_adam_has_a_group_for_each_learning_rate(utils, build):
+    config, _, loss_module = build()
     rates = {
         parameter: group["lr"]
         for group in utils.make_optimizer(config.loss.lr, loss_module).param_groups
@@ -343,21 +320,17 @@ def test_adam_has_a_group_for_each_learning_rate(utils):
     assert len(rates) == len(list(loss_module.parameters()))
 
 
-@pytest.mark.parametrize(
-    ("env", "rate", "gain"), [("pendulum", 1e-3, 1.0), ("ant", 1e-3, 1.0), ("humanoid", 3e-4, 0.01)]
-)
-def test_on_humanoid_ecac_s_policy_starts_small_and_learns_slower(utils, env, rate, gain):
-    config = configure([f"env={env}"])
-    assert config.loss.lr.actor_network == rate
-    pendulum = utils.make_environment(configure([]), seed=0)
-    actor = utils.make_actor(config, pendulum)  # of whichever task
-    assert next(iter(actor)).final_gain == gain
-
-
-@pytest.mark.parametrize("loss", [name for name in LOSSES if name != "ecac"])
-def test_the_others_are_on_humanoid_as_they_are_elsewhere(loss):
-    there, elsewhere = (configure([f"env={env}", f"loss={loss}"]) for env in ("humanoid", "ant"))
-    assert there.loss == elsewhere.loss
+def test_on_humanoid_ecac_s_policy_alone_starts_small_and_learns_slower(utils):
+    env = utils.make_environment(configure([]), seed=0)  # whichever
+    for name, rate, gain in (("pendulum", 1e-3, 1.0), ("ant", 1e-3, 1.0), ("humanoid", 3e-4, 0.01)):
+        config = configure([f"env={name}"])
+        assert config.loss.lr.actor_network == rate
+        assert next(iter(utils.make_actor(config, env))).final_gain == gain
+    for loss in set(LOSSES) - {"ecac"}:
+        there, elsewhere = (
+            configure([f"env={env}", f"loss={loss}"]) for env in ("humanoid", "ant")
+        )
+        assert there.loss == elsewhere.loss
 
 
 def test_every_asks_once_an_interval(utils):

@@ -13,11 +13,9 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.checkpoint import StateDictCheckpointAdapter
-from torchrl.collectors import Collector
-from torchrl.envs import Compose, ParallelEnv, RewardSum, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import Compose, ParallelEnv, RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_ecpo.envs._groups import GroupIdAllocator
@@ -76,45 +74,39 @@ def act(td: TensorDictBase, action: Tensor, active: Tensor | None = None) -> Ten
 def test_recorded_episodes_are_reproduced(task):
     episodes = recordings("algorithmic")[GYM_NAMES[task]]
     assert len(episodes) == 200
-    batch = (50, 4)
-    env = AlgorithmicEnv(task, num_groups=batch[0], group_size=batch[1])
-    td = env.reset(instance=as_instance([e["input"] for e in episodes], batch))
+    env = AlgorithmicEnv(task, num_groups=50, group_size=4)
+    td = env.reset(instance=as_instance([e["input"] for e in episodes], (50, 4)))
     steps = torch.tensor([len(e["actions"]) for e in episodes])
     longest = int(steps.max())
     actions = pad([e["actions"] for e in episodes], longest, 0)
     observations = pad([e["observations"] for e in episodes], longest + 1)
-    rewards = pad([e["rewards"] for e in episodes], longest, 0.0)
-    dones = pad([e["dones"] for e in episodes], longest, True)
-    heads = pad([e["read_head_after"] for e in episodes], longest, 0)
-    largest = torch.tensor([e["max_reward"] for e in episodes])
-
-    assert td["attainable"].flatten().equal(largest.float())
+    recorded = {
+        "observation": observations[:, 1:],
+        "reward": pad([e["rewards"] for e in episodes], longest, 0.0),
+        "done": pad([e["dones"] for e in episodes], longest, True),
+        "terminated": pad([e["dones"] for e in episodes], longest, True),
+        "previous_action": actions,
+        "head": pad([e["read_head_after"] for e in episodes], longest, 0),
+    }
+    assert td["attainable"].flatten().tolist() == [e["max_reward"] for e in episodes]
     assert td["observation"].flatten().equal(observations[:, 0])
     total = torch.zeros(len(episodes))
     for t in range(longest):
         active = t < steps
-        before, head_before = td["observation"].flatten(), read_head(env)
-        following = env.step(act(td, actions[:, t], active))["next"]
-        head = torch.where(
-            active.reshape(batch + (1,) * (heads.ndim - 2)),
-            heads[:, t].reshape(head_before.shape),
-            head_before,
-        )
-        assert (
-            following["observation"]
-            .flatten()
-            .equal(torch.where(active, observations[:, t + 1], before))
-        )
-        assert following["reward"].flatten().equal(rewards[:, t])
-        assert following["done"].flatten().equal(dones[:, t])
-        assert following["terminated"].equal(following["done"])
+        td = env.step(act(td, actions[:, t]))
+        following = td["next"]
         assert not following["truncated"].any()
-        assert following["previous_action"].reshape(-1, 3)[active].equal(actions[active, t])
-        assert read_head(env).equal(head)
+        # Episodes that have ended stay ended.
+        assert following["done"].flatten()[~active].all()
+        assert not following["reward"].flatten()[~active].any()
         total += following["reward"].flatten()
+        now = {**following, "head": read_head(env)}
+        for key, value in recorded.items():
+            expected = value[active, t]
+            assert now[key].flatten(0, 1)[active].reshape(expected.shape).equal(expected)
         td = env.step_mdp(td)
     assert td["done"].all()
-    assert total.equal(torch.tensor([e["total_reward"] for e in episodes]))
+    assert total.tolist() == [e["total_reward"] for e in episodes]
 
 
 @pytest.mark.parametrize("task", TASK_NAMES)
@@ -152,8 +144,10 @@ def input_of(task: str, length: int, target_length: int) -> list:
     return [[2 if target_length > length else 0] * rows] * length
 
 
+@pytest.mark.parametrize("episodes", [60, pytest.param(400, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("task", TASK_NAMES)
-def test_recorded_curricula_are_reproduced(task):
+def test_recorded_curricula_are_reproduced(task, episodes):
+    """The first 60 episodes have successes, failures and, in all tasks, some rise of the level."""
     runs = recordings("algorithmic_curriculum")[GYM_NAMES[task]]
     batch = (len(runs), 1)
     first = torch.tensor([run["init_reset_target_len"] for run in runs])
@@ -163,7 +157,7 @@ def test_recorded_curricula_are_reproduced(task):
 
     # The recording's episode from before the first reset is drawn, here as there.
     env = next(e for e in map(make, range(10_000)) if e.state_dict()["_bound"][:, 0].equal(first))
-    for played in zip(*(run["episodes"] for run in runs), strict=True):
+    for played in zip(*(run["episodes"][:episodes] for run in runs), strict=True):
         levels, lengths, target_lengths, returns = (
             torch.tensor(x) for x in zip(*played, strict=True)
         )
@@ -192,21 +186,6 @@ def test_recorded_curricula_are_reproduced(task):
 RIGHT = 1
 
 
-@pytest.mark.parametrize(
-    ("task", "mean"),
-    [
-        ("copy", 31),
-        ("duplicated_input", 46 / 3),
-        ("repeat_copy", 93),
-        ("reverse", 31),
-        ("reversed_addition", 31.5),
-    ],
-)
-def test_mean_attainable_at_the_last_level(task, mean):
-    env = AlgorithmicEnv(task, num_groups=5000, min_length=30, seed=0)
-    assert env.reset()["attainable"].mean().item() == pytest.approx(mean, rel=0.002)
-
-
 def read_tape(env: AlgorithmicEnv, columns: int) -> tuple[TensorDictBase, Tensor]:
     """Reset, then read so many columns of the first row of the input."""
     td, seen = env.reset(), []
@@ -217,7 +196,7 @@ def read_tape(env: AlgorithmicEnv, columns: int) -> tuple[TensorDictBase, Tensor
     return start, torch.stack(seen, -1)
 
 
-@pytest.mark.parametrize("task", ["copy", "reverse", "duplicated_input"])
+@pytest.mark.parametrize("task", [name for name in TASK_NAMES if name != "reversed_addition3"])
 def test_lengths_and_characters_are_uniform(task):
     count, base = 6000, TASKS[task].base
     env = AlgorithmicEnv(task, num_groups=count, min_length=6, curriculum=None, seed=3)
@@ -298,6 +277,8 @@ def test_copies_share_instances_when_they_are_reset_at_different_times(curriculu
         own = {group for groups in row for group in groups}
         assert not ids & own
         ids |= own
+    td = env.reset()  # brings all in step
+    assert td["group"].equal(td["group"][:, :1].expand(-1, 3))
 
 
 def partial_reset(
@@ -306,44 +287,12 @@ def partial_reset(
     return env.reset(td.clone().set("_reset", copies.unsqueeze(-1)), **options)
 
 
-def test_a_copy_may_run_far_ahead_and_a_full_reset_brings_all_in_step():
-    env = AlgorithmicEnv("copy", num_groups=2, group_size=2, seed=1)
-    td = env.reset()
-    leader = torch.tensor([[True, False], [False, False]])
-    follower = torch.tensor([[False, True], [False, False]])
-
-    def advance(td: TensorDictBase, copies: Tensor) -> tuple[TensorDictBase, list]:
-        seen = []
-        for _ in range(11):
-            td = partial_reset(env, td, copies)
-            seen.append([td[key][copies].item() for key in ("group", "observation", "attainable")])
-        return td, seen
-
-    others = td["group"][1].clone()
-    td, ahead = advance(td, leader)
-    assert len({group for group, *_ in ahead}) == 11
-    td, behind = advance(td, follower)
-    assert behind == ahead
-    assert td["group"][1].equal(others)
-
-    td, _ = advance(td, leader)
-    td = env.reset()
-    assert td["group"][:, 0].equal(td["group"][:, 1])
-    assert td["group"].unique().numel() == 2
-
-
 @pytest.mark.parametrize("task", ["copy", "reversed_addition"])
 def test_partial_steps_leave_the_others_alone(task):
     make = partial(AlgorithmicEnv, task, num_groups=5, group_size=4, min_length=20)
     env, whole = make(), make()
     generator = torch.Generator().manual_seed(1)
-    td, sizes, advance = env.reset(), [], env._advance
-
-    def counting(rows: Any, action: Tensor) -> Tensor:
-        sizes.append(action.shape[0])
-        return advance(rows, action)
-
-    env._advance = counting
+    td = env.reset()
     for _ in range(12):
         active = torch.rand(5, 4, generator=generator) < 0.4
         actions = random_policy(env, generator) * torch.tensor([1, 0, 1])
@@ -357,36 +306,7 @@ def test_partial_steps_leave_the_others_alone(task):
         assert read_head(env)[active].equal(read_head(whole)[active])
         assert read_head(env)[~active].equal(head[~active])
         assert not td["next", "reward"][~active].any()
-        assert sizes.pop() == active.sum()
         td = env.step_mdp(td)
-
-
-def test_episodes_that_have_ended_stay_ended():
-    env = AlgorithmicEnv("copy", num_groups=2, seed=0)
-    td = env.reset(instance=as_instance([[1, 2, 3], [4, 2, 3]], (2, 1)))
-    rewards, dones = [], []
-    for character in (1, 2, 3, 4):
-        td = env.step(act(td, torch.tensor([RIGHT, 1, character]).expand(2, 3)))
-        rewards.append(td["next", "reward"].flatten().tolist())
-        dones.append(td["next", "done"].flatten().tolist())
-        td = env.step_mdp(td)
-    assert rewards == [[1.0, -0.5], [1.0, 0.0], [1.0, 0.0], [0.0, 0.0]]
-    assert dones == [[False, True], [False, True], [True, True], [True, True]]
-    assert read_head(env).flatten().tolist() == [3, 1]
-
-
-def test_rollouts_until_all_are_done():
-    env = AlgorithmicEnv("copy", num_groups=10, group_size=3, seed=0)
-    generator = torch.Generator().manual_seed(2)
-    rollout = env.rollout(
-        50,
-        lambda td: act(td, random_policy(env, generator)),
-        break_when_all_done=True,
-        break_when_any_done=False,
-    )
-    assert rollout["next", "done"][..., -1, :].all()
-    assert rollout.shape[-1] > 2
-    assert rollout["group"].equal(rollout["next", "group"])
 
 
 def finish(env: AlgorithmicEnv, td: TensorDictBase, perfect: Tensor) -> TensorDictBase:
@@ -449,28 +369,21 @@ def test_in_gyms_curriculum_copies_at_different_levels_play_different_groups():
     assert tape[:, 0].equal(tape[:, 1])
 
 
-def test_a_failure_starts_the_count_again():
-    env = AlgorithmicEnv("copy", seed=0)
-    right, wrong = torch.tensor([[True]]), torch.tensor([[False]])
-    assert levels_after(env, right, 9).item() == 2
-    assert levels_after(env, wrong, 1).item() == 2
-    assert levels_after(env, right, 9).item() == 2
-    assert levels_after(env, right, 1).item() == 3
-
-
-@pytest.mark.parametrize(("curriculum", "level"), [("group", 3), ("batch", 3), ("gym", 2)])
-def test_interrupted_episodes_count_in_gyms_curriculum_only(curriculum, level):
-    env = AlgorithmicEnv("copy", curriculum=curriculum, seed=0)
+@pytest.mark.parametrize(
+    ("options", "played", "levels"),
+    [
+        ({}, (9, -1, 9, 1), [2, 2, 2, 3]),  # a failure starts the count again
+        ({"min_length": 29}, (10, 10, 10), [30, 30, 30]),  # the last level
+        # An episode that is interrupted counts in gym's curriculum only.
+        ({"curriculum": "group"}, (5, 0, 5), [2, 2, 3]),
+        ({"curriculum": "batch"}, (5, 0, 5), [2, 2, 3]),
+        ({"curriculum": "gym"}, (5, 0, 5), [2, 2, 2]),
+    ],
+)
+def test_levels_after_so_many_successes_or_a_failure(options, played, levels):
+    env = AlgorithmicEnv("copy", seed=0, **options)
     right = torch.tensor([[True]])
-    levels_after(env, right, 5)
-    env.reset()
-    assert levels_after(env, right, 5).item() == level
-
-
-def test_the_curriculum_ends_at_30():
-    env = AlgorithmicEnv("copy", min_length=29, seed=0)
-    right = torch.tensor([[True]])
-    assert [levels_after(env, right, 10).item() for _ in range(3)] == [30, 30, 30]
+    assert [levels_after(env, right ^ (n < 0), abs(n)).item() for n in played] == levels
 
 
 def test_stale_instances_do_not_count():
@@ -490,40 +403,31 @@ def test_stale_instances_do_not_count():
 CONTINUED = ("observation", "previous_action", "level", "attainable", "done", ("next", "reward"))
 
 
-@pytest.mark.parametrize("via", ["torch.save", "checkpoint"])
 @pytest.mark.parametrize("curriculum", ["group", "batch", "gym"])
-def test_a_restored_environment_goes_on_identically(curriculum, via, tmp_path):
+def test_a_restored_environment_goes_on_identically(curriculum):
     make = partial(AlgorithmicEnv, "reverse", num_groups=3, group_size=2, curriculum=curriculum)
     env, other = make(seed=0), make(seed=1)
 
-    def go_on(env: AlgorithmicEnv, td: TensorDictBase, steps: int) -> TensorDict:
+    def go_on(env: AlgorithmicEnv, td: TensorDictBase, steps: int) -> tuple[Any, TensorDictBase]:
         generator = torch.Generator().manual_seed(steps)
         result = []
         for _ in range(steps):
             stepped, td = env.step_and_maybe_reset(act(td, random_policy(env, generator)))
             result.append(stepped)
-        return torch.stack(result)
+        return torch.stack(result), td
 
     go_on(env, env.reset(), 53)
     assert env.state_dict()["_queue.level"].shape[1] > 1, "instances should be pending"
-    generator = torch.Generator().manual_seed(7)
-    td = env.step_and_maybe_reset(act(env.reset(), random_policy(env, generator)))[1]
-    for _ in range(20):
-        td = env.step_and_maybe_reset(act(td, random_policy(env, generator)))[1]
-    if via == "checkpoint":
-        adapter = StateDictCheckpointAdapter()
-        adapter.save(env, tmp_path, args=(), kwargs={})
-        adapter.load(other, tmp_path, map_location=None, tensor_load_kwargs={}, args=(), kwargs={})
-    else:
-        file = io.BytesIO()
-        torch.save(env.state_dict(), file)
-        file.seek(0)
-        other.load_state_dict(torch.load(file, weights_only=True))
+    _, td = go_on(env, env.reset(), 21)
+    file = io.BytesIO()
+    torch.save(env.state_dict(), file)
+    file.seek(0)
+    other.load_state_dict(torch.load(file, weights_only=True))
     twin = copy.deepcopy(env)
     assert other.curriculum.levels.equal(env.curriculum.levels)
-    expected = go_on(env, td.clone(), 200)
+    expected, _ = go_on(env, td.clone(), 200)
     for continued in (other, twin):
-        got = go_on(continued, td.clone(), 200)
+        got, _ = go_on(continued, td.clone(), 200)
         for key in CONTINUED:
             assert got[key].equal(expected[key]), key
         assert got["group"][0].equal(expected["group"][0])
@@ -576,46 +480,19 @@ def test_specs(task):
     }
 
 
-def test_in_a_collector():
-    env = TransformedEnv(AlgorithmicEnv("reverse", num_groups=4, group_size=2, seed=0), RewardSum())
-    collector = Collector(
-        env, None, frames_per_batch=160, total_frames=320, auto_register_policy_transforms=False
-    )
-    batches = list(collector)
-    assert [batch.shape for batch in batches] == [(4, 2, 20)] * 2
-    for batch in batches:
-        done = batch["next", "done"][..., :-1, 0]
-        # A new trajectory is a new instance, and one instance lasts a trajectory.
-        assert (batch["group"][..., 1:] != batch["group"][..., :-1]).equal(done)
-        assert batch["episode_reward"].shape == (4, 2, 20, 1)
-    collector.shutdown()
-
-
-def test_in_parallel_environments():
-    makers = [
-        partial(AlgorithmicEnv, "copy", num_groups=3, group_size=2, seed=seed) for seed in (0, 1)
-    ]
+def test_partial_steps_of_parallel_environments():
+    # TorchRL lets a "_step" mask choose among workers, not within one.
+    makers = [partial(AlgorithmicEnv, "copy", seed=seed) for seed in (0, 1)]
     env = ParallelEnv(2, makers, mp_start_method="fork")
     try:
-        first = env.reset()
-        assert first.batch_size == (2, 3, 2)
-        assert first["group"][..., 0].equal(first["group"][..., 1])
-        assert first["group"].unique().numel() == 6
-        for seed, part in enumerate(first["observation"]):
-            assert part.equal(makers[seed]().reset()["observation"])
-        rollout = env.rollout(20, break_when_any_done=False)
-        assert rollout.shape == (2, 3, 2, 20)
-        assert rollout["next", "done"].any()
+        rollout = env.rollout(30, break_when_any_done=False, break_when_all_done=True)
+        for maker, first in zip(makers, rollout["observation"][..., 0], strict=True):
+            assert first.equal(maker().reset()["observation"])
     finally:
         env.close()
-
-
-def test_partial_steps_of_batched_environments():
-    # TorchRL lets a "_step" mask choose among workers, not within one.
-    env = SerialEnv(4, [partial(AlgorithmicEnv, "copy", seed=seed) for seed in range(4)])
-    rollout = env.rollout(30, break_when_any_done=False, break_when_all_done=True)
     assert rollout["next", "done"][..., -1, :].all()
     assert rollout.shape[-1] < 30
+    assert rollout["group"].unique().numel() == 2
 
 
 def test_group_ids_are_unique():
@@ -660,7 +537,6 @@ def test_bad_arguments_are_refused(arguments, message):
         ("copy", torch.zeros(1, 2, 33, dtype=torch.int64), r"L in 1\.\.32, got \[1, 2, 33\]"),
         ("copy", torch.zeros(1, 2, 3), "dtype torch.int64, got torch.float32"),
         ("copy", torch.tensor([[[1, 2], [5, 1]]]), r"characters in 0\.\.4, .* got \[5, 1, -1"),
-        ("copy", torch.tensor([[[1, 2], [-2, 1]]]), r"got \[-2, 1, -1"),
         ("copy", torch.tensor([[[1, 2], [-1, -1]]]), r"at least one, .* got \[-1, -1"),
         ("copy", torch.tensor([[[1, 2, 0], [1, -1, 1]]]), r"then -1 as padding, .* got \[1, -1, 1"),
         (
@@ -685,8 +561,6 @@ def test_malformed_instances_are_refused(task, instance, message):
     ("action", "message"),
     [
         ([2, 0, 0], r"of copy must lie between \[0, 0, 0\] and \[1, 1, 4\], got \[2, 0, 0\]"),
-        ([0, 2, 0], r"got \[0, 2, 0\]"),
-        ([0, 0, 5], r"got \[0, 0, 5\]"),
         ([0, -1, 0], r"got \[0, -1, 0\]"),
         ([0, 0], r"int64 of shape \[1, 2, 3\], got torch.int64 of shape \[1, 2, 2\]"),
         ([0.0, 0.0, 0.0], "int64 of shape .* got torch.float32"),
@@ -704,7 +578,3 @@ def test_only_the_actions_that_are_taken_are_checked():
     env = AlgorithmicEnv("copy", group_size=2, seed=0)
     td = act(env.reset(), torch.tensor([[0, 0, 0], [9, 9, 9]]), torch.tensor([True, False]))
     assert not env.step(td)["next", "done"].any()
-
-
-if __name__ == "__main__":
-    pytest.main([__file__])
