@@ -1,19 +1,21 @@
-"""What both families of losses share: the actor, temperatures, entries of a batch."""
+"""What both families of losses share: actor, temperatures, keys, checks and reduction."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Literal
+import math
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
-from tensordict import TensorDictBase, TensorDictParams
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
 
-from torchrl_ecpo.checks import as_float, check_choice, check_mask, present
+from torchrl_ecpo.checks import as_float, check_choice, check_mask, present, values_can_be_seen
 from torchrl_ecpo.functional import check_temperatures
 
 REDUCTIONS = ("none", "mean", "sum")
@@ -41,6 +43,10 @@ class PolicyLoss(LossModule):
 
     temperature_names: tuple[str, ...]
     """What :class:`~torchrl_ecpo.TemperatureScheduler` may write."""
+    losses: ClassVar[tuple[str, ...]] = ()
+    """Names of the further losses that a member returns; each begins with ``loss_``."""
+    metrics: ClassVar[tuple[str, ...]] = ()
+    """Names of the further metrics that it returns."""
 
     def __init__(
         self,
@@ -52,6 +58,7 @@ class PolicyLoss(LossModule):
         allow_zero: bool = False,
     ) -> None:
         self._in_keys: list[NestedKey] | None = None
+        self._out_keys: list[Any] | None = None
         super().__init__()
         if not hasattr(actor_network, "get_dist"):
             raise TypeError(
@@ -63,10 +70,15 @@ class PolicyLoss(LossModule):
         self.delay_actor = delay_actor
         self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
         self._allow_zero = allow_zero
-        device = next((parameter.device for parameter in self.parameters()), None)
         for name, value in self._as_temperatures(temperatures or {}).items():
-            self.register_coeff_buffer(name, value, device=device)
+            self.register_coeff_buffer(name, value, device=self._device)
         self.temperature_names = tuple(temperatures or ())
+
+    @property
+    def _device(self) -> torch.device | None:
+        return next((parameter.device for parameter in self.parameters()), None)
+
+    # ------------------------------------------------------------------------------- temperatures
 
     def _as_temperatures(
         self, values: Mapping[str, Any], *, allow_zero: bool = False
@@ -89,6 +101,58 @@ class PolicyLoss(LossModule):
         allowed = self._as_temperatures({**current, name: value}, allow_zero=has_learned)
         buffers[name].fill_(allowed[name])
 
+    # --------------------------------------------------------------------------------------- keys
+
+    @property
+    @abstractmethod
+    def _all_in_keys(self) -> list[NestedKey]:
+        """What the loss reads; a key may stand there twice."""
+
+    @property
+    @abstractmethod
+    def _all_out_keys(self) -> list[Any]:
+        """What the loss can return, in this order."""
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """What the loss reads; keywords of a call without a tensordict are these, joined by _."""
+        return list(dict.fromkeys(self._all_in_keys)) if self._in_keys is None else self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, keys: Sequence[NestedKey]) -> None:
+        self._in_keys = list(keys)
+
+    @property
+    def out_keys(self) -> list[Any]:
+        """What the loss returns, in this order."""
+        return self._all_out_keys if self._out_keys is None else self._out_keys
+
+    @out_keys.setter
+    def out_keys(self, keys: Sequence[NestedKey]) -> None:
+        self._out_keys = list(keys)
+
+    def select_out_keys(self, *out_keys: str) -> PolicyLoss:
+        """Return these entries only, until :meth:`reset_out_keys`.
+
+        Instead of TensorDict's own hook, which takes a call for one with keywords if an entry of
+        :attr:`in_keys` is absent: the mask and the states of a recurrent actor may be.
+        """
+        known = self._all_out_keys
+        if not out_keys or not {*out_keys} <= {*known}:
+            raise ValueError(f"Select some of the out_keys {known}, got {list(out_keys)}.")
+        self._out_keys = list(out_keys)
+        return self
+
+    def reset_out_keys(self) -> PolicyLoss:
+        """Undo :meth:`select_out_keys`."""
+        self._out_keys = None
+        return self
+
+    def set_keys(self, **kwargs: Any) -> None:
+        """Rename entries of the input, see :class:`_AcceptedKeys`; None is the default name."""
+        super().set_keys(**kwargs)
+        self._in_keys = None
+
     @property
     def mask_keys(self) -> tuple[NestedKey, ...]:
         """The masks that :attr:`loss_mask_key` names; with ``"auto"`` they may be absent."""
@@ -100,6 +164,13 @@ class PolicyLoss(LossModule):
     @property
     def _reward_key(self) -> NestedKey:
         return unravel_key(("next", self.tensor_keys.reward))
+
+    def _selected(self, outputs: Mapping[str, Tensor], shape: torch.Size) -> TensorDict:
+        """The entries of :attr:`out_keys`; each has this shape if nothing is reduced."""
+        selected = {key: outputs[key] for key in self.out_keys}
+        return TensorDict(selected, batch_size=shape if self.reduction == "none" else [])
+
+    # ------------------------------------------------------------------------------------- checks
 
     def _mask(self, tensordict: TensorDictBase, shape: torch.Size) -> Tensor | None:
         """Conjunction of the masks that are there."""
@@ -117,3 +188,77 @@ class PolicyLoss(LossModule):
             mask = check_mask(key, mask, shape)
             conjunction = mask if conjunction is None else conjunction & mask
         return conjunction
+
+    def _check_declared(self, losses: Mapping[str, Tensor], metrics: Mapping[str, Tensor]) -> None:
+        """Refuse other names than those in :attr:`out_keys`, which is known before the call."""
+        for kind, returned in (("losses", losses), ("metrics", metrics)):
+            declared = getattr(self, kind)
+            if {*declared} != {*returned}:
+                raise ValueError(
+                    f"{type(self).__name__} declares the {kind} {sorted(declared)}, but its "
+                    f"surrogate returned {sorted(returned)}. Declare what it returns ('ESS' and "
+                    "'max_weight' of trajectories are computed from weights that are not None)."
+                )
+
+    @staticmethod
+    def _check_values(quantities: Mapping[str, Tensor], *, of: str = "places") -> None:
+        """Refuse values that would silently spoil the networks. One look; none when compiled."""
+        if not values_can_be_seen():
+            return
+        if math.isfinite(sum(values.detach().sum() for values in quantities.values())):
+            return
+        for name, values in quantities.items():
+            strange = ~values.isfinite()
+            if strange.any():
+                raise ValueError(
+                    f"The {name} is NaN or infinite in {int(strange.sum())} of {strange.numel()} "
+                    f"{of}. Mend the environment, the observations or the networks that it comes "
+                    "from."
+                )
+
+
+class Reduction(NamedTuple):
+    """How numbers of each state, or group, become one: over the real ones, by replay's weights."""
+
+    kind: str
+    """``"mean"``, ``"sum"`` or ``"none"``."""
+    shape: torch.Size
+    """``[*B]``."""
+    mask: Tensor | None = None
+    weights: Tensor | None = None
+
+    def first(self, number: int | None) -> Reduction:
+        """Of the first states of the batch; of all if the number is None."""
+        if number is None:
+            return self
+        shape = torch.Size([min(number, self.shape[0]), *self.shape[1:]])
+        rows = [None if x is None else x[:number] for x in (self.mask, self.weights)]
+        return Reduction(self.kind, shape, *rows)
+
+    def loss(self, values: Tensor) -> Tensor:
+        """Of values ``[*B]``, or of one number."""
+        if values.shape != self.shape:
+            return values.expand(self.shape) if self.kind == "none" else values
+        if self.mask is not None:
+            values = values.where(self.mask, 0.0)
+        if self.weights is not None:
+            values = values * self.weights
+        if self.kind != "mean":
+            return values if self.kind == "none" else values.sum()
+        if self.weights is None:
+            return self.mean(values)
+        total = self.weights.sum()
+        return values.sum() / total.where(total > 0, 1.0)
+
+    def metric(self, values: Tensor) -> Tensor:
+        """The mean, without weights; or the values of each state with ``"none"``."""
+        values = values.detach()
+        if self.kind == "none":
+            return values.expand(self.shape)
+        return values if values.shape != self.shape else self.mean(values)
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Over the real states, without weights."""
+        if self.mask is None:
+            return values.mean()
+        return values.where(self.mask, 0.0).sum() / self.mask.sum().clamp_min(1)

@@ -44,8 +44,7 @@ class LearningTemperatures(PolicyLoss):
             )
         if name in dict(self.named_buffers(recurse=False)):
             delattr(self, name)
-        device = next((parameter.device for parameter in self.parameters()), None)
-        log_value = nn.Parameter(torch.tensor(math.log(start), device=device))
+        log_value = nn.Parameter(torch.tensor(math.log(start), device=self._device))
         self.register_parameter(f"log_{name}", log_value)
         self._learned = {**self._learned, name: (floor, instead)}
 
