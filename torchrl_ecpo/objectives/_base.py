@@ -5,18 +5,19 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.objectives import LossModule
 from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
 
 from torchrl_ecpo.checks import as_float, check_choice, check_mask, present, values_can_be_seen
-from torchrl_ecpo.functional import check_temperatures
+from torchrl_ecpo.functional import check_temperatures, temperature_dual
 
 REDUCTIONS = ("none", "mean", "sum")
 
@@ -26,14 +27,10 @@ class PolicyLoss(LossModule):
 
     A temperature is a 0-d buffer, so that ``state_dict`` carries it and ``to`` moves it.
     ``loss.tau = 0.1`` writes it in place; a value that is not allowed is refused, and the old one
-    stays.
+    stays. One that the loss learns (:meth:`learn`) is the parameter ``log_tau``. It has a floor,
+    below which :meth:`temperature` never reads, and cannot be set.
 
-    Args:
-        actor_network: a policy with ``get_dist``.
-        delay_actor: whether the loss keeps a delayed copy of the actor.
-        reduction: ``"mean"`` (None: the same), ``"sum"`` or ``"none"``.
-        temperatures: initial values by name; their names are :attr:`temperature_names`.
-        allow_zero: whether all temperatures may be 0 together.
+    The arguments are documented where users meet them.
     """
 
     tensor_keys: Any
@@ -43,6 +40,8 @@ class PolicyLoss(LossModule):
 
     temperature_names: tuple[str, ...]
     """What :class:`~torchrl_ecpo.TemperatureScheduler` may write."""
+    _learned: Mapping[str, tuple[float, str]] = MappingProxyType({})
+    """By name: the floor, and what to leave out to set it."""
     losses: ClassVar[tuple[str, ...]] = ()
     """Names of the further losses that a member returns; each begins with ``loss_``."""
     metrics: ClassVar[tuple[str, ...]] = ()
@@ -89,7 +88,11 @@ class PolicyLoss(LossModule):
         return temperatures
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Write a temperature in place, or refuse it and keep the old one."""
+        """Write a temperature in place; refuse what is learned, and what is not allowed."""
+        if name in self._learned:
+            instead = self._learned[name][1]
+            mend = f" Build the loss without {instead} to set or schedule it." if instead else ""
+            raise AttributeError(f"{name} is learned.{mend}")
         names = self.__dict__.get("temperature_names", ())
         buffers = dict(self.named_buffers(recurse=False)) if name in names else {}
         if name not in buffers:
@@ -100,6 +103,63 @@ class PolicyLoss(LossModule):
         has_learned = len(current) < len(names)
         allowed = self._as_temperatures({**current, name: value}, allow_zero=has_learned)
         buffers[name].fill_(allowed[name])
+
+    def learn(self, name: str, start: float, *, floor: float = 1e-6, instead: str = "") -> None:
+        """Learn a temperature, or the multiplier of a constraint, in log-space.
+
+        It is the parameter ``log_{name}``. Its loss is the caller's, such as :meth:`dual`.
+
+        Args:
+            name: of the temperature. What has been a scheduled one is no longer.
+            start: first value.
+            floor: least value, in the unit of the temperature.
+            instead: what to leave out so that it is not learned, for the message of who sets it.
+
+        Raises:
+            ValueError: unless 0 < floor <= start.
+        """
+        if not 0 < floor <= start:
+            raise ValueError(
+                f"A learned {name} must start at min_{name} > 0 or above, got {name}={start} and "
+                f"min_{name}={floor}."
+            )
+        if name in dict(self.named_buffers(recurse=False)):
+            delattr(self, name)
+        log_value = nn.Parameter(torch.tensor(math.log(start), device=self._device))
+        self.register_parameter(f"log_{name}", log_value)
+        self._learned = {**self._learned, name: (floor, instead)}
+
+    def temperature(self, name: str) -> Tensor:
+        """A temperature as it stands, 0-d and detached, scheduled or learned."""
+        if name not in self._learned:
+            return getattr(self, name)
+        log_temperature: Tensor = getattr(self, f"log_{name}")
+        return log_temperature.detach().exp().clamp_min(self._learned[name][0])
+
+    def temperatures(self) -> tuple[Tensor, ...]:
+        """Those that :attr:`temperature_names` names, as they stand: tau and tau'."""
+        return tuple(self.temperature(name) for name in self.temperature_names)
+
+    def dual(self, name: str, excess: Tensor, mean_excess: Tensor | None = None) -> Tensor:
+        """Loss of a learned temperature: up where a constraint is exceeded, else down.
+
+        At its floor a temperature is not sent further down: it would take long to return. (To clamp
+        the parameter itself would be a change in place, which a compiled graph forbids.)
+
+        Args:
+            name: of the temperature.
+            excess: ``[*B]``, by how much the constraint is exceeded.
+            mean_excess: 0-d, its mean over the real states, by default over all of them: it says
+                where the temperature is sent.
+
+        Returns:
+            ``[*B]``, :func:`~torchrl_ecpo.functional.temperature_dual`.
+        """
+        log_temperature: Tensor = getattr(self, f"log_{name}")
+        mean_excess = excess.mean() if mean_excess is None else mean_excess
+        is_at_floor = log_temperature.detach() <= math.log(self._learned[name][0])
+        excess = excess.masked_fill(is_at_floor & (mean_excess < 0), 0)
+        return temperature_dual(log_temperature, excess)
 
     # --------------------------------------------------------------------------------------- keys
 

@@ -36,7 +36,7 @@ from torchrl_ecpo.functional import (
     effective_sample_size,
     self_normalised_weights,
 )
-from torchrl_ecpo.objectives._base import Reduction
+from torchrl_ecpo.objectives._base import PolicyLoss, Reduction
 from torchrl_ecpo.objectives.actions import (
     Actions,
     AllActions,
@@ -44,7 +44,6 @@ from torchrl_ecpo.objectives.actions import (
     actions_of,
     is_discrete,
 )
-from torchrl_ecpo.objectives.temperatures import LearningTemperatures
 
 __all__ = ["ActorCriticLoss", "Lift", "States"]
 
@@ -89,7 +88,7 @@ class States:
         return self.made
 
 
-class ActorCriticLoss(LearningTemperatures):
+class ActorCriticLoss(PolicyLoss):
     """Base class of the actor-critic losses: lift the reference policy by soft Q, and project.
 
     A member implements :meth:`project`, and declares in :attr:`losses` and :attr:`metrics` what
@@ -283,7 +282,9 @@ class ActorCriticLoss(LearningTemperatures):
         transitions, mask = self._read(tensordict)
         weights = self._priority_weights(transitions, mask)
         target = self.soft_bellman_target(transitions, mask)
-        loss_qvalue, td_error = self._qvalue_loss(transitions, target)
+        qvalue = self._chosen_qvalue(transitions)
+        td_error = (qvalue.detach() - target).abs().amax(0)
+        errors = distance_loss(qvalue, target.expand_as(qvalue), self.loss_function)  # Eq. 10
         states = self.states(transitions)
         surrogate = self.project(states)
         self._check_declared(surrogate.losses, surrogate.metrics)
@@ -309,13 +310,11 @@ class ActorCriticLoss(LearningTemperatures):
         losses |= self._temperature_losses(lift.actions, metrics, of_states)
         priority = td_error if mask is None else td_error.where(mask, 0.0)
         tensordict.set(self.tensor_keys.priority, priority)
-        tau, tau_prime = self.temperatures()
+        metrics["tau"], metrics["tau_prime"] = self.temperatures()
         outputs = {
-            "loss_qvalue": of_all.loss(loss_qvalue),
+            "loss_qvalue": of_all.loss(errors.sum(0)),
             **{name: of_states.loss(loss) for name, loss in losses.items()},
             **{name: of_states.metric(value) for name, value in metrics.items()},
-            "tau": of_states.metric(tau),
-            "tau_prime": of_states.metric(tau_prime),
         }
         return self._selected(outputs, transitions.shape)
 
@@ -444,13 +443,6 @@ class ActorCriticLoss(LearningTemperatures):
         policy = self._distribution(observations, params)
         number, critics = self.num_next_action_samples, self.target_qvalue_network_params
         return self.lift(observations, policy, critics, number).value
-
-    def _qvalue_loss(self, tensordict: TensorDictBase, target: Tensor) -> tuple[Tensor, Tensor]:
-        """Eq. 10, summed over the Q networks, and the largest error of them: both ``[*B]``."""
-        qvalue = self._chosen_qvalue(tensordict)
-        target = target.expand_as(qvalue)
-        loss = distance_loss(qvalue, target, loss_function=self.loss_function).sum(0)
-        return loss, (qvalue.detach() - target).abs().amax(0)
 
     def _chosen_qvalue(self, tensordict: TensorDictBase) -> Tensor:
         """Soft Q ``[N, *B]`` of the actions that were taken; carries the gradient."""
@@ -643,9 +635,8 @@ class ActorCriticLoss(LearningTemperatures):
         return transitions, mask
 
     def _priority_weights(self, tensordict: TensorDictBase, mask: Tensor | None) -> Tensor | None:
-        if not self.use_prioritized_weights:
-            return None
-        weights = tensordict.get(self.tensor_keys.priority_weight, None)
+        key = self.tensor_keys.priority_weight
+        weights = tensordict.get(key, None) if self.use_prioritized_weights else None
         if weights is None:
             return None
         weights = weights.reshape(tensordict.shape)

@@ -412,15 +412,10 @@ class TrajectoryGroupLoss(PolicyLoss):
 class LiftProjectLoss(TrajectoryGroupLoss):
     """A :class:`TrajectoryGroupLoss` that lifts a reference policy by Eq. 5 and projects onto it.
 
-    Args:
-        actor_network: see :class:`TrajectoryGroupLoss`.
-
     Keyword Args:
         tau: temperature of the divergence from the reference policy, in the unit of the return.
             Defaults to 0.5, the middle of the values searched on the algorithmic tasks.
         tau_prime: temperature of the entropy, in the unit of the return. Defaults to 0.
-        delay_actor: see :class:`TrajectoryGroupLoss`.
-        reduction: see :class:`TrajectoryGroupLoss`.
     """
 
     tau: Tensor
