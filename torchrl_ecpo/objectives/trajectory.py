@@ -247,14 +247,11 @@ class TrajectoryGroupLoss(PolicyLoss):
             behaviour = steps.behaviour_log_prob.sum(-1)
         returns, log_prob = steps.rewards.sum(-1), steps.log_prob.sum(-1)
         mask = None if steps.mask is None else steps.mask.any(-1)
-        quantities = {
-            f"entry {self._reward_key!r}": returns,
-            "log-probability under the reference policy": reference,
-            "log-probability under the actor": log_prob,
-        }
+        quantities = {f"entry {self._reward_key!r}": returns}
         if behaviour is not reference or not self.delay_actor:  # else it is not there
-            recorded = f"entry {self.tensor_keys.sample_log_prob!r}"
-            quantities = {recorded: behaviour, **quantities}
+            quantities[f"entry {self.tensor_keys.sample_log_prob!r}"] = behaviour
+        quantities["log-probability under the reference policy"] = reference
+        quantities["log-probability under the actor"] = log_prob
         self._check_values(quantities, of="trajectories")
         return TrajectoryGroups(returns, log_prob, reference, behaviour, mask, steps)
 
