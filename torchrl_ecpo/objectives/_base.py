@@ -1,20 +1,23 @@
-"""What both families of losses share: the actor, temperatures, entries of a batch."""
+"""What both families of losses share: actor, temperatures, keys, checks and reduction."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Literal
+import math
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
-from tensordict import TensorDictBase, TensorDictParams
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.objectives import LossModule
 from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
 
-from torchrl_ecpo.checks import as_float, check_choice, check_mask, present
-from torchrl_ecpo.functional import check_temperatures
+from torchrl_ecpo.checks import as_float, check_choice, check_mask, present, values_can_be_seen
+from torchrl_ecpo.functional import check_temperatures, temperature_dual
 
 REDUCTIONS = ("none", "mean", "sum")
 
@@ -24,14 +27,10 @@ class PolicyLoss(LossModule):
 
     A temperature is a 0-d buffer, so that ``state_dict`` carries it and ``to`` moves it.
     ``loss.tau = 0.1`` writes it in place; a value that is not allowed is refused, and the old one
-    stays.
+    stays. One that the loss learns (:meth:`learn`) is the parameter ``log_tau``. It has a floor,
+    below which :meth:`temperature` never reads, and cannot be set.
 
-    Args:
-        actor_network: a policy with ``get_dist``.
-        delay_actor: whether the loss keeps a delayed copy of the actor.
-        reduction: ``"mean"`` (None: the same), ``"sum"`` or ``"none"``.
-        temperatures: initial values by name; their names are :attr:`temperature_names`.
-        allow_zero: whether all temperatures may be 0 together.
+    The arguments are documented where users meet them.
     """
 
     tensor_keys: Any
@@ -41,6 +40,12 @@ class PolicyLoss(LossModule):
 
     temperature_names: tuple[str, ...]
     """What :class:`~torchrl_ecpo.TemperatureScheduler` may write."""
+    _learned: Mapping[str, tuple[float, str]] = MappingProxyType({})
+    """By name: the floor, and what to leave out to set it."""
+    losses: ClassVar[tuple[str, ...]] = ()
+    """Names of the further losses that a member returns; each begins with ``loss_``."""
+    metrics: ClassVar[tuple[str, ...]] = ()
+    """Names of the further metrics that it returns."""
 
     def __init__(
         self,
@@ -52,6 +57,7 @@ class PolicyLoss(LossModule):
         allow_zero: bool = False,
     ) -> None:
         self._in_keys: list[NestedKey] | None = None
+        self._out_keys: list[Any] | None = None
         super().__init__()
         if not hasattr(actor_network, "get_dist"):
             raise TypeError(
@@ -63,10 +69,15 @@ class PolicyLoss(LossModule):
         self.delay_actor = delay_actor
         self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
         self._allow_zero = allow_zero
-        device = next((parameter.device for parameter in self.parameters()), None)
         for name, value in self._as_temperatures(temperatures or {}).items():
-            self.register_coeff_buffer(name, value, device=device)
+            self.register_coeff_buffer(name, value, device=self._device)
         self.temperature_names = tuple(temperatures or ())
+
+    @property
+    def _device(self) -> torch.device | None:
+        return next((parameter.device for parameter in self.parameters()), None)
+
+    # ------------------------------------------------------------------------------- temperatures
 
     def _as_temperatures(
         self, values: Mapping[str, Any], *, allow_zero: bool = False
@@ -77,7 +88,11 @@ class PolicyLoss(LossModule):
         return temperatures
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Write a temperature in place, or refuse it and keep the old one."""
+        """Write a temperature in place; refuse what is learned, and what is not allowed."""
+        if name in self._learned:
+            instead = self._learned[name][1]
+            mend = f" Build the loss without {instead} to set or schedule it." if instead else ""
+            raise AttributeError(f"{name} is learned.{mend}")
         names = self.__dict__.get("temperature_names", ())
         buffers = dict(self.named_buffers(recurse=False)) if name in names else {}
         if name not in buffers:
@@ -88,6 +103,115 @@ class PolicyLoss(LossModule):
         has_learned = len(current) < len(names)
         allowed = self._as_temperatures({**current, name: value}, allow_zero=has_learned)
         buffers[name].fill_(allowed[name])
+
+    def learn(self, name: str, start: float, *, floor: float = 1e-6, instead: str = "") -> None:
+        """Learn a temperature, or the multiplier of a constraint, in log-space.
+
+        It is the parameter ``log_{name}``. Its loss is the caller's, such as :meth:`dual`.
+
+        Args:
+            name: of the temperature. What has been a scheduled one is no longer.
+            start: first value.
+            floor: least value, in the unit of the temperature.
+            instead: what to leave out so that it is not learned, for the message of who sets it.
+
+        Raises:
+            ValueError: unless 0 < floor <= start.
+        """
+        if not 0 < floor <= start:
+            raise ValueError(
+                f"A learned {name} must start at min_{name} > 0 or above, got {name}={start} and "
+                f"min_{name}={floor}."
+            )
+        if name in dict(self.named_buffers(recurse=False)):
+            delattr(self, name)
+        log_value = nn.Parameter(torch.tensor(math.log(start), device=self._device))
+        self.register_parameter(f"log_{name}", log_value)
+        self._learned = {**self._learned, name: (floor, instead)}
+
+    def temperature(self, name: str) -> Tensor:
+        """A temperature as it stands, 0-d and detached, scheduled or learned."""
+        if name not in self._learned:
+            return getattr(self, name)
+        log_temperature: Tensor = getattr(self, f"log_{name}")
+        return log_temperature.detach().exp().clamp_min(self._learned[name][0])
+
+    def temperatures(self) -> tuple[Tensor, ...]:
+        """Those that :attr:`temperature_names` names, as they stand: tau and tau'."""
+        return tuple(self.temperature(name) for name in self.temperature_names)
+
+    def dual(self, name: str, excess: Tensor, mean_excess: Tensor | None = None) -> Tensor:
+        """Loss of a learned temperature: up where a constraint is exceeded, else down.
+
+        At its floor a temperature is not sent further down: it would take long to return. (To clamp
+        the parameter itself would be a change in place, which a compiled graph forbids.)
+
+        Args:
+            name: of the temperature.
+            excess: ``[*B]``, by how much the constraint is exceeded.
+            mean_excess: 0-d, its mean over the real states, by default over all of them: it says
+                where the temperature is sent.
+
+        Returns:
+            ``[*B]``, :func:`~torchrl_ecpo.functional.temperature_dual`.
+        """
+        log_temperature: Tensor = getattr(self, f"log_{name}")
+        mean_excess = excess.mean() if mean_excess is None else mean_excess
+        is_at_floor = log_temperature.detach() <= math.log(self._learned[name][0])
+        excess = excess.masked_fill(is_at_floor & (mean_excess < 0), 0)
+        return temperature_dual(log_temperature, excess)
+
+    # --------------------------------------------------------------------------------------- keys
+
+    @property
+    @abstractmethod
+    def _all_in_keys(self) -> list[NestedKey]:
+        """What the loss reads; a key may stand there twice."""
+
+    @property
+    @abstractmethod
+    def _all_out_keys(self) -> list[Any]:
+        """What the loss can return, in this order."""
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """What the loss reads; keywords of a call without a tensordict are these, joined by _."""
+        return list(dict.fromkeys(self._all_in_keys)) if self._in_keys is None else self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, keys: Sequence[NestedKey]) -> None:
+        self._in_keys = list(keys)
+
+    @property
+    def out_keys(self) -> list[Any]:
+        """What the loss returns, in this order."""
+        return self._all_out_keys if self._out_keys is None else self._out_keys
+
+    @out_keys.setter
+    def out_keys(self, keys: Sequence[NestedKey]) -> None:
+        self._out_keys = list(keys)
+
+    def select_out_keys(self, *out_keys: str) -> PolicyLoss:
+        """Return these entries only, until :meth:`reset_out_keys`.
+
+        Instead of TensorDict's own hook, which takes a call for one with keywords if an entry of
+        :attr:`in_keys` is absent: the mask and the states of a recurrent actor may be.
+        """
+        known = self._all_out_keys
+        if not out_keys or not {*out_keys} <= {*known}:
+            raise ValueError(f"Select some of the out_keys {known}, got {list(out_keys)}.")
+        self._out_keys = list(out_keys)
+        return self
+
+    def reset_out_keys(self) -> PolicyLoss:
+        """Undo :meth:`select_out_keys`."""
+        self._out_keys = None
+        return self
+
+    def set_keys(self, **kwargs: Any) -> None:
+        """Rename entries of the input, see :class:`_AcceptedKeys`; None is the default name."""
+        super().set_keys(**kwargs)
+        self._in_keys = None
 
     @property
     def mask_keys(self) -> tuple[NestedKey, ...]:
@@ -100,6 +224,13 @@ class PolicyLoss(LossModule):
     @property
     def _reward_key(self) -> NestedKey:
         return unravel_key(("next", self.tensor_keys.reward))
+
+    def _selected(self, outputs: Mapping[str, Tensor], shape: torch.Size) -> TensorDict:
+        """The entries of :attr:`out_keys`; each has this shape if nothing is reduced."""
+        selected = {key: outputs[key] for key in self.out_keys}
+        return TensorDict(selected, batch_size=shape if self.reduction == "none" else [])
+
+    # ------------------------------------------------------------------------------------- checks
 
     def _mask(self, tensordict: TensorDictBase, shape: torch.Size) -> Tensor | None:
         """Conjunction of the masks that are there."""
@@ -117,3 +248,77 @@ class PolicyLoss(LossModule):
             mask = check_mask(key, mask, shape)
             conjunction = mask if conjunction is None else conjunction & mask
         return conjunction
+
+    def _check_declared(self, losses: Mapping[str, Tensor], metrics: Mapping[str, Tensor]) -> None:
+        """Refuse other names than those in :attr:`out_keys`, which is known before the call."""
+        for kind, returned in (("losses", losses), ("metrics", metrics)):
+            declared = getattr(self, kind)
+            if {*declared} != {*returned}:
+                raise ValueError(
+                    f"{type(self).__name__} declares the {kind} {sorted(declared)}, but its "
+                    f"surrogate returned {sorted(returned)}. Declare what it returns ('ESS' and "
+                    "'max_weight' of trajectories are computed from weights that are not None)."
+                )
+
+    @staticmethod
+    def _check_values(quantities: Mapping[str, Tensor], *, of: str = "places") -> None:
+        """Refuse values that would silently spoil the networks. One look; none when compiled."""
+        if not values_can_be_seen():
+            return
+        if math.isfinite(sum(values.detach().sum() for values in quantities.values())):
+            return
+        for name, values in quantities.items():
+            strange = ~values.isfinite()
+            if strange.any():
+                raise ValueError(
+                    f"The {name} is NaN or infinite in {int(strange.sum())} of {strange.numel()} "
+                    f"{of}. Mend the environment, the observations or the networks that it comes "
+                    "from."
+                )
+
+
+class Reduction(NamedTuple):
+    """How numbers of each state, or group, become one: over the real ones, by replay's weights."""
+
+    kind: str
+    """``"mean"``, ``"sum"`` or ``"none"``."""
+    shape: torch.Size
+    """``[*B]``."""
+    mask: Tensor | None = None
+    weights: Tensor | None = None
+
+    def first(self, number: int | None) -> Reduction:
+        """Of the first states of the batch; of all if the number is None."""
+        if number is None:
+            return self
+        shape = torch.Size([min(number, self.shape[0]), *self.shape[1:]])
+        rows = [None if x is None else x[:number] for x in (self.mask, self.weights)]
+        return Reduction(self.kind, shape, *rows)
+
+    def loss(self, values: Tensor) -> Tensor:
+        """Of values ``[*B]``, or of one number."""
+        if values.shape != self.shape:
+            return values.expand(self.shape) if self.kind == "none" else values
+        if self.mask is not None:
+            values = values.where(self.mask, 0.0)
+        if self.weights is not None:
+            values = values * self.weights
+        if self.kind != "mean":
+            return values if self.kind == "none" else values.sum()
+        if self.weights is None:
+            return self.mean(values)
+        total = self.weights.sum()
+        return values.sum() / total.where(total > 0, 1.0)
+
+    def metric(self, values: Tensor) -> Tensor:
+        """The mean, without weights; or the values of each state with ``"none"``."""
+        values = values.detach()
+        if self.kind == "none":
+            return values.expand(self.shape)
+        return values if values.shape != self.shape else self.mean(values)
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Over the real states, without weights."""
+        if self.mask is None:
+            return values.mean()
+        return values.where(self.mask, 0.0).sum() / self.mask.sum().clamp_min(1)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import (
     CompositeDistribution,
     ProbabilisticTensorDictSequential,
@@ -30,13 +30,13 @@ from torchrl_ecpo.checks import (
     check_choice,
     check_count,
     get_entry,
-    values_can_be_seen,
 )
 from torchrl_ecpo.functional import (
     Surrogate,
     effective_sample_size,
     self_normalised_weights,
 )
+from torchrl_ecpo.objectives._base import PolicyLoss, Reduction
 from torchrl_ecpo.objectives.actions import (
     Actions,
     AllActions,
@@ -44,7 +44,6 @@ from torchrl_ecpo.objectives.actions import (
     actions_of,
     is_discrete,
 )
-from torchrl_ecpo.objectives.temperatures import LearningTemperatures
 
 __all__ = ["ActorCriticLoss", "Lift", "States"]
 
@@ -89,7 +88,7 @@ class States:
         return self.made
 
 
-class ActorCriticLoss(LearningTemperatures):
+class ActorCriticLoss(PolicyLoss):
     """Base class of the actor-critic losses: lift the reference policy by soft Q, and project.
 
     A member implements :meth:`project`, and declares in :attr:`losses` and :attr:`metrics` what
@@ -99,10 +98,6 @@ class ActorCriticLoss(LearningTemperatures):
     The arguments are documented where users meet them: :class:`~torchrl_ecpo.ECACLoss`.
     """
 
-    losses: ClassVar[tuple[str, ...]] = ()
-    """Names of the further losses that :meth:`project` returns; each begins with ``loss_``."""
-    metrics: ClassVar[tuple[str, ...]] = ()
-    """Names of the further metrics that it returns."""
     has_soft_value: ClassVar[bool] = True
     """Whether a state is worth its soft value (Eq. 8), or else the reference's mean of Q."""
 
@@ -173,7 +168,6 @@ class ActorCriticLoss(LearningTemperatures):
         skip_done_states: bool = False,
         use_prioritized_weights: bool | Literal["auto"] = "auto",
     ) -> None:
-        self._out_keys: list[NestedKey] | None = None
         super().__init__(
             actor_network,
             delay_actor=delay_actor,
@@ -216,8 +210,7 @@ class ActorCriticLoss(LearningTemperatures):
         if target_entropy is not None:
             instead = "target_entropy"
             self.learn("tau_prime", float(tau_prime), floor=min_tau_prime, instead=instead)
-        device = next((parameter.device for parameter in self.parameters()), None)
-        self.make_value_estimator(device=device)
+        self.make_value_estimator(device=self._device)
         action_keys = getattr(actor_network, "dist_sample_keys", None)
         if action_keys:
             self.set_keys(action=action_keys[0])
@@ -289,10 +282,12 @@ class ActorCriticLoss(LearningTemperatures):
         transitions, mask = self._read(tensordict)
         weights = self._priority_weights(transitions, mask)
         target = self.soft_bellman_target(transitions, mask)
-        loss_qvalue, td_error = self._qvalue_loss(transitions, target)
+        qvalue = self._chosen_qvalue(transitions)
+        td_error = (qvalue.detach() - target).abs().amax(0)
+        errors = distance_loss(qvalue, target.expand_as(qvalue), self.loss_function)  # Eq. 10
         states = self.states(transitions)
         surrogate = self.project(states)
-        self._check_declared(surrogate)
+        self._check_declared(surrogate.losses, surrogate.metrics)
         lift = states.lift
         self._check_values(
             {
@@ -315,29 +310,13 @@ class ActorCriticLoss(LearningTemperatures):
         losses |= self._temperature_losses(lift.actions, metrics, of_states)
         priority = td_error if mask is None else td_error.where(mask, 0.0)
         tensordict.set(self.tensor_keys.priority, priority)
-        tau, tau_prime = self.temperatures()
+        metrics["tau"], metrics["tau_prime"] = self.temperatures()
         outputs = {
-            "loss_qvalue": of_all.loss(loss_qvalue),
+            "loss_qvalue": of_all.loss(errors.sum(0)),
             **{name: of_states.loss(loss) for name, loss in losses.items()},
             **{name: of_states.metric(value) for name, value in metrics.items()},
-            "tau": of_states.metric(tau),
-            "tau_prime": of_states.metric(tau_prime),
         }
-        return TensorDict(
-            {key: outputs[key] for key in self._all_out_keys},
-            batch_size=transitions.shape if self.reduction == "none" else [],
-        )
-
-    def _check_declared(self, surrogate: Surrogate) -> None:
-        """Refuse further losses and metrics of other names than those in :attr:`out_keys`."""
-        for kind in ("losses", "metrics"):
-            declared, returned = {*getattr(self, kind)}, {*getattr(surrogate, kind)}
-            if declared != returned:
-                raise ValueError(
-                    f"{type(self).__name__} declares the {kind} {sorted(declared)}, but its "
-                    f"surrogate returned {sorted(returned)}: both must be the same, as out_keys is "
-                    "known before the first call."
-                )
+        return self._selected(outputs, transitions.shape)
 
     # ---------------------------------------------------------------------------------- the lift
 
@@ -359,7 +338,15 @@ class ActorCriticLoss(LearningTemperatures):
         number = self.num_action_samples if num_samples is None else num_samples
         params = self.qvalue_network_params if qvalue_params is None else qvalue_params
         with torch.no_grad():
-            actions, score = self._scored(observations, reference, params, number)
+            actions = actions_of(reference, number)
+            score = self.score_of(observations, actions, params)
+            if actions.log_prob.shape != score.shape:
+                raise ValueError(
+                    f"The soft Q values of the actions have the shape {tuple(score.shape)}, their "
+                    f"log-probabilities {tuple(actions.log_prob.shape)}: actor and Q network must "
+                    "know the same actions, and an action of several numbers has one "
+                    "log-probability, as with torch.distributions.Independent or TanhNormal."
+                )
             log_weights, value = actions.lift(score, *self.temperatures())
             weights = self_normalised_weights(log_weights, sample_dim=0)
             if not self.has_soft_value:
@@ -381,30 +368,6 @@ class ActorCriticLoss(LearningTemperatures):
         inputs = observations.expand(shape).reshape(rows)
         inputs.set(self.tensor_keys.action, actions.action.reshape(*rows, actions.action.shape[-1]))
         return self._qvalues(inputs, qvalue_params).amin(0).reshape(shape)
-
-    def _scored(
-        self,
-        observations: TensorDictBase,
-        policy: Distribution,
-        qvalue_params: TensorDictParams,
-        num_samples: int,
-    ) -> tuple[Actions, Tensor]:
-        actions = actions_of(policy, num_samples)
-        score = self.score_of(observations, actions, qvalue_params)
-        if actions.log_prob.shape != score.shape:
-            raise ValueError(
-                f"The soft Q values of the actions have the shape {tuple(score.shape)}, their "
-                f"log-probabilities {tuple(actions.log_prob.shape)}: actor and Q network must know "
-                "the same actions, and an action of several numbers has one log-probability, as "
-                "with torch.distributions.Independent or TanhNormal."
-            )
-        return actions, score
-
-    def _value(self, actions: Actions, score: Tensor) -> Tensor:
-        """What a state is worth ``[*B]``; lifted only if that is a soft value."""
-        if not self.has_soft_value:
-            return actions.mean(score)
-        return actions.lift(score, *self.temperatures())[1]
 
     def states(self, transitions: Any) -> States:
         """Where the policy learns, the policy, and the reference: its delayed copy, or itself."""
@@ -479,14 +442,7 @@ class ActorCriticLoss(LearningTemperatures):
         params = self.target_actor_network_params if self.delay_actor else self.actor_network_params
         policy = self._distribution(observations, params)
         number, critics = self.num_next_action_samples, self.target_qvalue_network_params
-        return self._value(*self._scored(observations, policy, critics, number))
-
-    def _qvalue_loss(self, tensordict: TensorDictBase, target: Tensor) -> tuple[Tensor, Tensor]:
-        """Eq. 10, summed over the Q networks, and the largest error of them: both ``[*B]``."""
-        qvalue = self._chosen_qvalue(tensordict)
-        target = target.expand_as(qvalue)
-        loss = distance_loss(qvalue, target, loss_function=self.loss_function).sum(0)
-        return loss, (qvalue.detach() - target).abs().amax(0)
+        return self.lift(observations, policy, critics, number).value
 
     def _chosen_qvalue(self, tensordict: TensorDictBase) -> Tensor:
         """Soft Q ``[N, *B]`` of the actions that were taken; carries the gradient."""
@@ -612,7 +568,6 @@ class ActorCriticLoss(LearningTemperatures):
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         keys, names = self.tensor_keys, ("value", "reward", "done", "terminated")
         self.value_estimator.set_keys(**{name: getattr(keys, name) for name in names})
-        self._in_keys = None
 
     # ---------------------------------------------------------------------------------- reporting
 
@@ -638,39 +593,19 @@ class ActorCriticLoss(LearningTemperatures):
     # --------------------------------------------------------------------------------------- keys
 
     @property
-    def in_keys(self) -> list[NestedKey]:
-        """What the loss reads; keywords of a call without a tensordict are these, joined by _."""
-        if self._in_keys is None:
-            keys = self.tensor_keys
-            following = [keys.reward, keys.done, keys.terminated, *self._next_observations]
-            self._in_keys = list(
-                dict.fromkeys(
-                    [
-                        keys.action,
-                        *self.actor_network.in_keys,
-                        *self.qvalue_network.in_keys,
-                        *(() if self.value_network is None else self.value_network.in_keys),
-                        *(unravel_key(("next", key)) for key in following),
-                    ]
-                )
-            )
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, keys: Sequence[NestedKey]) -> None:
-        self._in_keys = list(keys)
+    def _all_in_keys(self) -> list[NestedKey]:
+        keys = self.tensor_keys
+        following = [keys.reward, keys.done, keys.terminated, *self._next_observations]
+        return [
+            keys.action,
+            *self.actor_network.in_keys,
+            *self.qvalue_network.in_keys,
+            *(() if self.value_network is None else self.value_network.in_keys),
+            *(unravel_key(("next", key)) for key in following),
+        ]
 
     @property
-    def out_keys(self) -> list[NestedKey]:
-        """What the loss returns, in this order."""
-        return list(self._all_out_keys) if self._out_keys is None else self._out_keys
-
-    @out_keys.setter
-    def out_keys(self, keys: Sequence[NestedKey]) -> None:
-        self._out_keys = list(keys)
-
-    @property
-    def _all_out_keys(self) -> list[str]:
+    def _all_out_keys(self) -> list[Any]:
         of_value = () if self.value_network is None else ("loss_value",)
         of_tau = () if self.target_kl is None else ("loss_tau",)
         of_tau_prime = () if self.target_entropy is None else ("loss_tau_prime",)
@@ -700,9 +635,8 @@ class ActorCriticLoss(LearningTemperatures):
         return transitions, mask
 
     def _priority_weights(self, tensordict: TensorDictBase, mask: Tensor | None) -> Tensor | None:
-        if not self.use_prioritized_weights:
-            return None
-        weights = tensordict.get(self.tensor_keys.priority_weight, None)
+        key = self.tensor_keys.priority_weight
+        weights = tensordict.get(key, None) if self.use_prioritized_weights else None
         if weights is None:
             return None
         weights = weights.reshape(tensordict.shape)
@@ -752,69 +686,6 @@ class ActorCriticLoss(LearningTemperatures):
                 )
                 + f"; its in_keys are {network.in_keys}."
             )
-
-    @staticmethod
-    def _check_values(quantities: dict[str, Tensor]) -> None:
-        """Refuse values that would silently spoil the networks. One look; none when compiled."""
-        if not values_can_be_seen():
-            return
-        if math.isfinite(sum(values.detach().sum() for values in quantities.values())):
-            return
-        for name, values in quantities.items():
-            strange = ~values.isfinite()
-            if strange.any():
-                raise ValueError(
-                    f"The {name} is NaN or infinite in {int(strange.sum())} of {strange.numel()} "
-                    "places. Mend the environment, the observations or the networks that it comes "
-                    "from."
-                )
-
-
-class Reduction(NamedTuple):
-    """How numbers of each state become one: over the real states, by the weights of replay."""
-
-    kind: str
-    """``"mean"``, ``"sum"`` or ``"none"``."""
-    shape: torch.Size
-    """``[*B]``."""
-    mask: Tensor | None
-    weights: Tensor | None
-
-    def first(self, number: int | None) -> Reduction:
-        """Of the first states of the batch; of all if the number is None."""
-        if number is None:
-            return self
-        shape = torch.Size([min(number, self.shape[0]), *self.shape[1:]])
-        rows = [None if x is None else x[:number] for x in (self.mask, self.weights)]
-        return Reduction(self.kind, shape, *rows)
-
-    def loss(self, values: Tensor) -> Tensor:
-        """Of values ``[*B]``, or of one number."""
-        if values.shape != self.shape:
-            return values.expand(self.shape) if self.kind == "none" else values
-        if self.mask is not None:
-            values = values.where(self.mask, 0.0)
-        if self.weights is not None:
-            values = values * self.weights
-        if self.kind != "mean":
-            return values if self.kind == "none" else values.sum()
-        if self.weights is None:
-            return self.mean(values)
-        total = self.weights.sum()
-        return values.sum() / total.where(total > 0, 1.0)
-
-    def metric(self, values: Tensor) -> Tensor:
-        """The mean, without weights; or the values of each state with ``"none"``."""
-        values = values.detach()
-        if self.kind == "none":
-            return values.expand(self.shape)
-        return values if values.shape != self.shape else self.mean(values)
-
-    def mean(self, values: Tensor) -> Tensor:
-        """Over the real states, without weights."""
-        if self.mask is None:
-            return values.mean()
-        return values.where(self.mask, 0.0).sum() / self.mask.sum().clamp_min(1)
 
 
 def _saturation(action: Tensor, policy: Distribution) -> Tensor:

@@ -90,10 +90,10 @@ class ECACLoss(ActorCriticLoss):
     that their sum can be backpropagated at once; and, detached, ``ESS`` of the weights,
     ``kl_target_reference`` = KL(target, pi_bar), ``kl_reference_policy`` = KL(pi_bar, pi_theta),
     ``entropy`` of the reference, ``saturation`` (share of action components in the outer 5 % of
-    their range),
-    ``qvalue``, ``state_value``, ``tau`` and ``tau_prime``. The temporal difference error is written
-    into the input as ``"td_error"``, 0 where the entry ``("collector", "mask")`` says that a
-    transition is not real: such transitions are not looked at, whatever stands there.
+    their range), ``qvalue``, ``state_value``, ``tau`` and ``tau_prime``. The
+    temporal difference error is written into the input as ``"td_error"``, 0 where the entry
+    ``("collector", "mask")`` says that a transition is not real: such transitions are not looked
+    at, whatever stands there.
 
     Raises:
         ValueError: for discrete actions, a Q network that reads no action, a value network without
@@ -105,15 +105,11 @@ class ECACLoss(ActorCriticLoss):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
-        >>> from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+        >>> from torchrl.data import Bounded
         >>> from torchrl_ecpo import PolyakAverage
-        >>> net = torch.nn.Sequential(torch.nn.Linear(3, 4), NormalParamExtractor())
-        >>> module = TensorDictModule(net, ["observation"], ["loc", "scale"])
-        >>> actor = ProbabilisticActor(module, ["loc", "scale"], distribution_class=TanhNormal)
-        >>> qvalue = ValueOperator(
-        ...     MLP(in_features=5, out_features=1, num_cells=[8]), ["observation", "action"])
-        >>> loss_module = ECACLoss(actor, qvalue)
+        >>> from torchrl_ecpo.modules import make_qvalue_network, make_tanh_gaussian_actor
+        >>> actor = make_tanh_gaussian_actor(3, Bounded(-1.0, 1.0, shape=(2,)))
+        >>> loss_module = ECACLoss(actor, make_qvalue_network(3, 2))
         >>> updater = PolyakAverage(loss_module, "qvalue_network")
         >>> batch = TensorDict({
         ...     "observation": torch.randn(5, 3),
@@ -167,29 +163,23 @@ class DiscreteECACLoss(ECACLoss):
         L(\theta) = -\sum_a \bar\pi^*(a|s) \log \pi_\theta(a|s), \quad
         \bar\pi^*(a|s) = \mathrm{softmax}_a \frac{Q(s, a) + \tau \log \bar\pi(a|s)}{\tau + \tau'}
 
+    Arguments, errors and outputs are those of :class:`ECACLoss`, without what concerns samples
+    (``saturation`` among the outputs), and with these differences:
+
     Args:
         actor_network: a policy with ``get_dist`` over ``n`` actions: ``Categorical`` or
             ``OneHotCategorical``, TorchRL's masked ones among them: actions that a mask forbids
             have no part in the lift.
         qvalue_network: reads the observation, writes ``"action_value"`` ``[*B, n]``.
-        value_network: as for :class:`ECACLoss`.
 
     Keyword Args:
-        tau_prime: as for :class:`ECACLoss`. Default: 0.1.
+        tau_prime: default: 0.1.
         target_kl: KL(target, pi_bar) in nats that tau is learned to hold. Default: 0.1.
-        target_entropy: entropy in nats that tau_prime is learned to hold; ``"auto"`` is
-            0.98 log n, that of TorchRL's ``DiscreteSACLoss``. None (default): tau_prime is fixed,
-            or scheduled by assignment.
-        options: as for :class:`ECACLoss`, but for those of samples.
-
-    The outputs are those of :class:`ECACLoss` without ``saturation``.
-
-    Raises:
-        ValueError: as for :class:`ECACLoss`.
+        target_entropy: ``"auto"`` is 0.98 log n, that of TorchRL's ``DiscreteSACLoss``. Default:
+            None, a fixed tau_prime.
 
     Examples:
         >>> import torch
-        >>> from tensordict import TensorDict
         >>> from tensordict.nn import TensorDictModule
         >>> from torch.distributions import Categorical
         >>> from torchrl.modules import ProbabilisticActor
@@ -197,17 +187,12 @@ class DiscreteECACLoss(ECACLoss):
         >>> actor = ProbabilisticActor(net, ["logits"], distribution_class=Categorical)
         >>> qvalue = TensorDictModule(torch.nn.Linear(3, 4), ["observation"], ["action_value"])
         >>> loss_module = DiscreteECACLoss(actor, qvalue, delay_qvalue=False)
-        >>> batch = TensorDict({
-        ...     "observation": torch.randn(5, 3),
-        ...     "action": torch.randint(4, (5,)),
-        ...     "next": {
-        ...         "observation": torch.randn(5, 3),
-        ...         "reward": torch.rand(5, 1),
-        ...         "done": torch.zeros(5, 1, dtype=torch.bool),
-        ...         "terminated": torch.zeros(5, 1, dtype=torch.bool),
-        ...     },
-        ... }, batch_size=[5])
-        >>> loss_module(batch)["loss_actor"].backward()
+        >>> loss_actor, *_ = loss_module(
+        ...     observation=torch.randn(5, 3), action=torch.randint(4, (5,)),
+        ...     next_observation=torch.randn(5, 3), next_reward=torch.rand(5, 1),
+        ...     next_done=torch.zeros(5, 1, dtype=torch.bool),
+        ...     next_terminated=torch.zeros(5, 1, dtype=torch.bool))
+        >>> loss_actor.backward()
     """
 
     def __init__(

@@ -33,8 +33,6 @@ class PMDLoss(LiftProjectLoss):
         reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
     Examples:
-        The batch is that of :class:`ECPOLoss`, and so is the call without a tensordict.
-
         >>> from torchrl_ecpo.envs import BanditEnv
         >>> from torchrl_ecpo.modules import make_softmax_policy
         >>> env = BanditEnv(num_actions=6, num_groups=3, group_size=4)

@@ -28,37 +28,24 @@ class PMDACLoss(ActorCriticLoss):
 
     Over one of n actions it is (tau + tau') KL(pi, target) itself, summed over all of them.
 
-    Args:
-        actor_network: as for :class:`~torchrl_ecpo.ECACLoss`, with ``rsample``.
-        qvalue_network: as for :class:`~torchrl_ecpo.ECACLoss`.
-        value_network: as for :class:`~torchrl_ecpo.ECACLoss`.
+    Arguments, errors and outputs are those of :class:`~torchrl_ecpo.ECACLoss` without
+    ``projection``, and with these differences:
 
     Keyword Args:
         tau: temperature of the divergence from the reference, in the unit of Q. It has an effect
             with ``delay_actor=True`` only: a policy does not differ from itself. Default: 0.1.
-        target_kl: as for :class:`~torchrl_ecpo.ECACLoss`; needs several ``num_action_samples``.
-            Default: None, a fixed tau.
+        target_kl: needs several ``num_action_samples``. Default: None, a fixed tau.
         num_action_samples: actions of the reference by which lift, metrics and the value network's
             target are estimated; the projection does not need them. Default: 1.
-        delay_actor: as for :class:`~torchrl_ecpo.ECACLoss`. Default: True.
-        options: as for :class:`~torchrl_ecpo.ECACLoss`, but for ``projection``.
-
-    The outputs are those of :class:`~torchrl_ecpo.ECACLoss`.
-
-    Raises:
-        ValueError: as for :class:`~torchrl_ecpo.ECACLoss`.
+        delay_actor: default: True.
 
     Examples:
         >>> import torch
-        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
-        >>> from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+        >>> from torchrl.data import Bounded
         >>> from torchrl_ecpo import PeriodicCopy, PolyakAverage, UpdaterSequence
-        >>> net = torch.nn.Sequential(torch.nn.Linear(3, 4), NormalParamExtractor())
-        >>> module = TensorDictModule(net, ["observation"], ["loc", "scale"])
-        >>> actor = ProbabilisticActor(module, ["loc", "scale"], distribution_class=TanhNormal)
-        >>> qvalue = ValueOperator(
-        ...     MLP(in_features=5, out_features=1, num_cells=[8]), ["observation", "action"])
-        >>> loss_module = PMDACLoss(actor, qvalue, tau=0.1)
+        >>> from torchrl_ecpo.modules import make_qvalue_network, make_tanh_gaussian_actor
+        >>> actor = make_tanh_gaussian_actor(3, Bounded(-1.0, 1.0, shape=(2,)))
+        >>> loss_module = PMDACLoss(actor, make_qvalue_network(3, 2), tau=0.1)
         >>> updater = UpdaterSequence(
         ...     PeriodicCopy(loss_module, "actor_network", interval=100),
         ...     PolyakAverage(loss_module, "qvalue_network"))
@@ -113,20 +100,12 @@ class PMDACLoss(ActorCriticLoss):
 class DiscretePMDACLoss(PMDACLoss):
     r"""PMD-AC for discrete actions: (tau + tau') KL(pi, target), summed over all actions.
 
-    Args:
-        actor_network: as for :class:`~torchrl_ecpo.DiscreteECACLoss`.
-        qvalue_network: as for :class:`~torchrl_ecpo.DiscreteECACLoss`.
-        value_network: as for :class:`~torchrl_ecpo.DiscreteECACLoss`.
+    Networks, outputs and the meaning of the constraints are those of
+    :class:`~torchrl_ecpo.DiscreteECACLoss`, the other arguments those of :class:`PMDACLoss`.
 
     Keyword Args:
-        tau_prime: as for :class:`PMDACLoss`. Default: 0.1.
-        target_entropy: as for :class:`~torchrl_ecpo.DiscreteECACLoss`. Default: None.
-        options: as for :class:`PMDACLoss`, but for those of samples.
-
-    The outputs are those of :class:`~torchrl_ecpo.DiscreteECACLoss`.
-
-    Raises:
-        ValueError: as for :class:`~torchrl_ecpo.DiscreteECACLoss`.
+        tau_prime: default: 0.1.
+        target_entropy: default: None, a fixed tau_prime.
 
     Examples:
         >>> import torch
@@ -136,12 +115,8 @@ class DiscretePMDACLoss(PMDACLoss):
         >>> actor = ProbabilisticActor(net, ["logits"], distribution_class=OneHotCategorical)
         >>> qvalue = TensorDictModule(torch.nn.Linear(3, 4), ["observation"], ["action_value"])
         >>> loss_module = DiscretePMDACLoss(actor, qvalue, delay_actor=False, delay_qvalue=False)
-        >>> loss_actor, *_ = loss_module(
-        ...     observation=torch.randn(5, 3), action=torch.eye(4)[torch.randint(4, (5,))],
-        ...     next_observation=torch.randn(5, 3), next_reward=torch.rand(5, 1),
-        ...     next_done=torch.zeros(5, 1, dtype=torch.bool),
-        ...     next_terminated=torch.zeros(5, 1, dtype=torch.bool))
-        >>> loss_actor.backward()
+        >>> loss_module.out_keys[:3]
+        ['loss_actor', 'loss_qvalue', 'ESS']
     """
 
     def __init__(

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams, is_tensor_collection
+from tensordict import TensorDictBase, TensorDictParams, is_tensor_collection
 from tensordict.nn import (
     CompositeDistribution,
     ProbabilisticTensorDictModule,
@@ -28,7 +28,7 @@ from torchrl_ecpo.functional import (
     self_normalised_weights,
     uniform_weights,
 )
-from torchrl_ecpo.objectives._base import PolicyLoss
+from torchrl_ecpo.objectives._base import PolicyLoss, Reduction
 
 __all__ = ["LiftProjectLoss", "Steps", "TrajectoryGroupLoss", "TrajectoryGroups"]
 
@@ -129,8 +129,6 @@ class TrajectoryGroupLoss(PolicyLoss):
         ...         return Surrogate(loss, None, metrics={"advantage": advantage.abs().mean(-1)})
     """
 
-    losses: ClassVar[tuple[str, ...]] = ()
-    """Names of the further losses that :meth:`surrogate` returns; each begins with ``loss_``."""
     metrics: ClassVar[tuple[str, ...]] = OF_WEIGHTS
     """Names of the metrics that are the member's own.
 
@@ -185,7 +183,6 @@ class TrajectoryGroupLoss(PolicyLoss):
         repeated = [name for name in self._all_out_keys if self._all_out_keys.count(name) > 1]
         if repeated:
             raise ValueError(f"Names of every loss, or declared twice: {sorted(set(repeated))}.")
-        self.out_keys = self._all_out_keys
 
     # ------------------------------------------------------------------------------- one method
 
@@ -215,76 +212,30 @@ class TrajectoryGroupLoss(PolicyLoss):
             ess, largest = effective_sample_size(found.weights), found.weights.amax(-1)
             of_weights = {"ESS": ess, "max_weight": largest}
             metrics |= {name: of_weights[name] for name in OF_WEIGHTS if name in self.metrics}
-        self._check_declared("losses", self.losses, found.losses)
-        self._check_declared("metrics", self.metrics, metrics)
+        self._check_declared(found.losses, metrics)
         metrics |= _of_groups(groups)
-        metrics = {k: v.detach().to(found.loss.dtype) for k, v in metrics.items()}
+        reduction = Reduction(self.reduction, found.loss.shape)
         losses = {"loss_actor": found.loss, **found.losses}
-        if self.reduction == "none":
-            shape = found.loss.shape
-            outputs: dict[Any, Tensor] = {k: v.expand(shape) for k, v in (losses | metrics).items()}
-        else:
-            shape, reduce = torch.Size([]), torch.sum if self.reduction == "sum" else torch.mean
-            outputs = {name: reduce(loss) for name, loss in losses.items()}
-            outputs |= {name: value.mean() for name, value in metrics.items()}
-        return TensorDict({key: outputs[key] for key in self.out_keys}, batch_size=shape)
-
-    def _check_declared(
-        self, kind: str, declared: tuple[str, ...], returned: Mapping[str, Tensor]
-    ) -> None:
-        """Refuse other names than those in :attr:`out_keys`, which is known before the call."""
-        if {*declared} != {*returned}:
-            raise ValueError(
-                f"{type(self).__name__} declares the {kind} {sorted(declared)}, but its surrogate "
-                f"returned {sorted(returned)}. Declare what it returns ('ESS' and 'max_weight' are"
-                " computed from weights that are not None)."
-            )
+        outputs = {name: reduction.loss(value) for name, value in losses.items()}
+        for name, value in metrics.items():
+            outputs[name] = reduction.metric(value.to(found.loss.dtype))
+        return self._selected(outputs, found.loss.shape)
 
     # ------------------------------------------------------------------------------------- keys
 
     @property
-    def in_keys(self) -> list[NestedKey]:
-        """What the loss reads; keywords of a call without a tensordict are these, joined by _."""
-        if self._in_keys is not None:
-            return self._in_keys
-        keys = [
+    def _all_in_keys(self) -> list[NestedKey]:
+        return [
             *self.actor_network.in_keys,
             *_as_list(self.tensor_keys.action),
             self._reward_key,
             *_as_list(self.tensor_keys.sample_log_prob),
             *self.mask_keys[:1],
         ]
-        return list(dict.fromkeys(keys))
-
-    @in_keys.setter
-    def in_keys(self, keys: Sequence[NestedKey]) -> None:
-        self._in_keys = list(keys)
-
-    def set_keys(self, **kwargs: Any) -> None:
-        """Rename entries of the input, see :class:`_AcceptedKeys`; None is the default name."""
-        super().set_keys(**kwargs)
-        self._in_keys = None
 
     @property
     def _all_out_keys(self) -> list[Any]:
         return ["loss_actor", *self.losses, *self.metrics, *OF_GROUPS]
-
-    def select_out_keys(self, *out_keys: str) -> TrajectoryGroupLoss:
-        """Return these entries only, until :meth:`reset_out_keys`.
-
-        Instead of TensorDict's own hook, which takes a call for one with keywords if an entry of
-        :attr:`in_keys` is absent: the mask and the states of a recurrent actor may be.
-        """
-        known = self._all_out_keys
-        if not out_keys or not {*out_keys} <= {*known}:
-            raise ValueError(f"Select some of the out_keys {known}, got {list(out_keys)}.")
-        self.out_keys = list(out_keys)
-        return self
-
-    def reset_out_keys(self) -> TrajectoryGroupLoss:
-        """Undo :meth:`select_out_keys`."""
-        self.out_keys = self._all_out_keys
-        return self
 
     # ---------------------------------------------------------------------------------- reading
 
@@ -296,16 +247,20 @@ class TrajectoryGroupLoss(PolicyLoss):
             behaviour = steps.behaviour_log_prob.sum(-1)
         returns, log_prob = steps.rewards.sum(-1), steps.log_prob.sum(-1)
         mask = None if steps.mask is None else steps.mask.any(-1)
-        groups = TrajectoryGroups(returns, log_prob, reference, behaviour, mask, steps)
-        self._check_values(groups)
-        return groups
+        quantities = {f"entry {self._reward_key!r}": returns}
+        if behaviour is not reference or not self.delay_actor:  # else it is not there
+            quantities[f"entry {self.tensor_keys.sample_log_prob!r}"] = behaviour
+        quantities["log-probability under the reference policy"] = reference
+        quantities["log-probability under the actor"] = log_prob
+        self._check_values(quantities, of="trajectories")
+        return TrajectoryGroups(returns, log_prob, reference, behaviour, mask, steps)
 
     def _read_steps(self, tensordict: TensorDictBase) -> Steps:
         reward = get_entry(tensordict, self._reward_key)
         shape = _batch_shape(reward, self._reward_key)
         mask = self._mask(tensordict, shape)
         if mask is not None and values_can_be_seen():
-            check_padding(self.mask_keys, mask)
+            self._check_mask(mask)
 
         def real(values: Tensor) -> Tensor:
             # A sum over a completion of 1,000 tokens would be off by nats in half precision, and
@@ -439,47 +394,25 @@ class TrajectoryGroupLoss(PolicyLoss):
             total = total + value.detach()
         return total
 
-    def _check_values(self, groups: TrajectoryGroups) -> None:
-        """Refuse values that would silently spoil a whole group. One look; none when compiled."""
-        if not values_can_be_seen():
-            return
-        quantities = {
-            f"entry {self._reward_key!r}": groups.returns,
-            f"entry {self.tensor_keys.sample_log_prob!r}": groups.behaviour_log_prob,
-            "log-probability under the reference policy": groups.reference_log_prob,
-            "log-probability under the actor": groups.log_prob,
-        }
-        if groups.behaviour_log_prob is groups.reference_log_prob and self.delay_actor:
-            del quantities[f"entry {self.tensor_keys.sample_log_prob!r}"]  # it is not there
-        finite = torch.stack(list(quantities.values())).isfinite()
-        is_group = finite.new_ones(()) if groups.mask is None else groups.mask.sum(-1) >= 2
-        if bool(finite.all() & is_group.all()):
-            return
-        if not is_group.all():
+    def _check_mask(self, mask: Tensor) -> None:
+        """Refuse holes, and groups of which too little is left."""
+        check_padding(self.mask_keys, mask)
+        is_small = mask.any(-1).sum(-1) < 2
+        if is_small.any():
             raise ValueError(
-                f"The mask ({self.mask_keys}) leaves {int((~is_group).sum())} group(s) "
+                f"The mask ({self.mask_keys}) leaves {int(is_small.sum())} group(s) "
                 "with fewer than two trajectories that have a real step: weights are relative to "
                 "the other trajectories of the group. Drop such groups before calling the loss."
             )
-        name, values = next(item for item in quantities.items() if not item[1].isfinite().all())
-        raise ValueError(
-            f"The {name} is NaN or infinite in {int((~values.isfinite()).sum())} of "
-            f"{values.numel()} trajectories. Mend the environment or the policy that it comes from."
-        )
 
 
 class LiftProjectLoss(TrajectoryGroupLoss):
     """A :class:`TrajectoryGroupLoss` that lifts a reference policy by Eq. 5 and projects onto it.
 
-    Args:
-        actor_network: see :class:`TrajectoryGroupLoss`.
-
     Keyword Args:
         tau: temperature of the divergence from the reference policy, in the unit of the return.
             Defaults to 0.5, the middle of the values searched on the algorithmic tasks.
         tau_prime: temperature of the entropy, in the unit of the return. Defaults to 0.
-        delay_actor: see :class:`TrajectoryGroupLoss`.
-        reduction: see :class:`TrajectoryGroupLoss`.
     """
 
     tau: Tensor
