@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import math
 import pickle
-import warnings
 from copy import deepcopy
 from dataclasses import replace
 
@@ -251,20 +250,6 @@ def test_each_loss_reaches_its_own_parameters_only(case, delay):
     assert not any(buffer.requires_grad for buffer in loss.buffers())
 
 
-def test_parameters_are_the_users():
-    """Changed in place, they change the actor that was passed in."""
-    networks = make_networks()
-    loss = CASE.build(networks)
-    for parameter in loss.parameters():
-        parameter.data.fill_(0.5)
-    assert all((parameter == 0.5).all() for parameter in networks.actor.parameters())
-    policy = loss.get_stateful_net("actor_network")
-    assert policy is not loss.actor_network
-    assert all((parameter == 0.5).all() for parameter in policy.parameters())
-    loss.from_stateful_net("actor_network", make_networks(seed=2).actor)
-    assert not any((parameter == 0.5).all() for parameter in networks.actor.parameters())
-
-
 # ------------------------------------------------------------------------------- delays, updaters
 
 
@@ -294,16 +279,6 @@ def test_delay_flags(value, delay_actor, delay_qvalue):
         assert (f"target_{name}_params" in dict(loss.named_children())) is delayed, name
     assert (loss.delay_actor, loss.delay_qvalue) == tuple(is_delayed.values())[:2]
     assert call(loss, _batch())["loss_qvalue"].isfinite()
-
-
-def test_a_live_q_is_what_the_target_sees():
-    """``delay_qvalue=False``: the online networks, as if they had just been copied."""
-    loss, *_ = _trained(delay_qvalue=False, delay_actor=False)
-    copied, *_ = _trained(delay_qvalue=True, delay_actor=False)
-    expected = call(loss, _batch())
-    assert not torch.allclose(call(copied, _batch())["loss_qvalue"], expected["loss_qvalue"])
-    PolyakAverage(copied, weight=1.0).step()
-    assert_close(call(copied, _batch()), expected)
 
 
 @losses
@@ -340,16 +315,6 @@ def test_updaters(case):
     become(loss, new)
     updater.step()
     assert distances(loss) == pytest.approx({name: 0.75 * d for name, d in before.items()})
-
-
-def test_warning_without_an_updater():
-    """TorchRL's own; a loss without targets never warns."""
-    with pytest.warns(UserWarning, match="No target network updater has been associated"):
-        CASE.build(value=True, updater=False)(_batch())
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        loss = CASE.build(delay_actor=False, delay_qvalue=False, updater=False)
-        call(deepcopy(loss), _batch())["loss_actor"].backward()
 
 
 # -------------------------------------------------------------------------------------- the module
@@ -707,43 +672,37 @@ def test_recurrent_q_network():
     ],
 )
 def test_forbidden_actions_have_no_part(name, distribution, tau):
-    """All numbers and gradients are those of a problem without the forbidden action."""
-    case = CASES[name]
-    forbidden, rest = CHOICES - 1, slice(CHOICES - 1)
-    allowed = torch.arange(CHOICES) != forbidden
-    networks = make_networks("categorical")
-    head = TensorDictModule(nn.Linear(OBSERVATION, CHOICES), ["observation"], ["logits"])
-    smaller = TensorDictModule(nn.Linear(OBSERVATION, forbidden), ["observation"], ["logits"])
-    qvalues = [make_qvalue("categorical").double() for _ in range(2)]
-    for key, value in head.named_parameters():
-        smaller.get_parameter(key).data = value.data[rest].clone()
-    masked = ProbabilisticActor(
-        head,
-        {"logits": "logits", "mask": "action_mask"},
-        distribution_class=distribution,
-    ).double()
-    plain = ProbabilisticActor(smaller, ["logits"], distribution_class=Categorical).double()
-    fewer = [deepcopy(network) for network in qvalues]
-    for network in fewer:
-        last = [module for module in network.modules() if isinstance(module, nn.Linear)][-1]
-        last.weight.data, last.bias.data = last.weight.data[rest], last.bias.data[rest]
-
-    batch = _batch(case)
-    one_hot = torch.eye(CHOICES)[torch.arange(6) % forbidden]
+    """All numbers and gradients are those of a problem without the forbidden action, the last."""
+    case, batch, networks = CASES[name], _batch(CASES[name]), make_networks("categorical")
     for where in (batch, batch["next"]):
-        where["action_mask"] = allowed.expand(6, CHOICES)
-    results = []
-    for actor, critics, action in ((masked, qvalues, one_hot), (plain, fewer, one_hot[:, rest])):
-        networks.actor, networks.qvalues = actor, critics
+        where["action_mask"] = (torch.arange(CHOICES) < CHOICES - 1).expand(6, CHOICES)
+
+    def of_the_first(number, distribution, **mask):
+        def module(seed, key):
+            torch.manual_seed(seed)
+            linear = nn.Linear(OBSERVATION, CHOICES).double()
+            linear.weight.data, linear.bias.data = (
+                linear.weight.data[:number],
+                linear.bias.data[:number],
+            )
+            return TensorDictModule(linear, ["observation"], [key])
+
+        networks.actor = ProbabilisticActor(
+            module(0, "logits"), {"logits": "logits", **mask}, distribution_class=distribution
+        )
+        networks.qvalues = [module(seed, "action_value") for seed in (1, 2)]
         loss = case.build(networks, tau=tau, delay_actor=False)
-        outputs = call(loss, batch.clone().set("action", action))
-        results.append((outputs, gradients(loss, total(outputs))))
-    (actual, gradient), (expected, of_fewer) = results
+        action = torch.eye(CHOICES)[torch.arange(6) % (CHOICES - 1)]
+        outputs = call(loss, batch.clone().set("action", action[:, :number]))
+        return outputs, gradients(loss, total(outputs))
+
+    actual, gradient = of_the_first(CHOICES, distribution, mask="action_mask")
+    expected, of_fewer = of_the_first(CHOICES - 1, Categorical)
     assert_close(actual.exclude("qvalue"), expected.exclude("qvalue"))
     for key, value in of_fewer.items():
-        if key.endswith("weight") and "actor" in key:
-            assert_close(gradient[key][rest], value)
-            assert (gradient[key][forbidden] == 0).all()
+        if "actor" in key:
+            assert_close(gradient[key][:-1], value)
+            assert (gradient[key][-1] == 0).all()
 
 
 # ------------------------------------------------------------------------------ masks and weights
@@ -801,22 +760,6 @@ def test_masked_transitions_count_nothing(case, weighted):
     nothing = loss(spoilt)
     assert total(nothing) == 0
     assert all((g == 0).all() for g in gradients(loss, total(nothing)).values())
-
-
-def test_mask_can_be_ignored_or_renamed():
-    """``loss_mask_key`` of TorchRL."""
-    loss, batch = CASE.build(), _batch()
-    plain = call(loss, batch)
-    batch[MASK] = torch.arange(6) < 3
-    masked = call(loss, batch)
-    assert not torch.allclose(masked["loss_qvalue"], plain["loss_qvalue"])
-    loss.loss_mask_key = None
-    assert_close(call(loss, batch), plain)
-    loss.loss_mask_key = "valid"
-    with pytest.raises(KeyError, match="'valid' is missing"):
-        call(loss, batch)
-    batch["valid"] = batch[MASK]
-    assert_close(call(loss, batch), masked)
 
 
 # ------------------------------------------------------------------------------ value estimation
@@ -898,29 +841,22 @@ def test_value_estimator_of_the_users():
     assert_close(call(loss.double(), batch), expected)
 
 
-@pytest.mark.parametrize("n", [1, 3])
-def test_n_step_returns(n):
+def test_n_step_returns():
     """Of TorchRL's transform: the discount of the value is gamma to the number of steps."""
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(10),
-        transform=MultiStepTransform(n_steps=n, gamma=GAMMA),
-        batch_size=4,
-    )
+    transform = MultiStepTransform(n_steps=3, gamma=GAMMA)
+    storage = LazyTensorStorage(10)
+    buffer = TensorDictReplayBuffer(storage=storage, transform=transform, batch_size=4)
     trajectory = _batch(CASE, 8)
-    trajectory["next", "done"].zero_()
-    trajectory["next", "terminated"].zero_()
+    for key in ("done", "terminated"):
+        trajectory["next", key].zero_()
     buffer.extend(trajectory)
     stored = buffer[:].exclude("index")
-    assert (stored["steps_to_next_obs"] == n).all()
+    assert (stored["steps_to_next_obs"] == 3).all()
     values = torch.arange(1.0, len(stored) + 1).double()
-    loss = CASE.build(value=True)
-    plain = call(loss, stored.clone())
-    _fixed_next_value(loss, values)
-    expected = stored["next", "reward"].squeeze(-1) + GAMMA**n * values
+    loss = _fixed_next_value(CASE.build(), values)
+    expected = stored["next", "reward"].squeeze(-1) + GAMMA**3 * values
     # The transform discounts in float32.
     assert_close(loss.soft_bellman_target(stored), expected, rtol=1e-5, atol=1e-6)
-    one_step = call(CASE.build(value=True), stored.exclude("steps_to_next_obs"))
-    assert torch.allclose(plain["loss_qvalue"], one_step["loss_qvalue"]) is (n == 1)
 
 
 @losses
@@ -986,16 +922,12 @@ def test_num_actor_states(case, n):
 # ------------------------------------------------------------------------------------ temperatures
 
 
-def test_temperatures_are_scheduled_by_assignment():
-    """loss.tau = x writes into the buffer: same tensor, dtype and place; the next call uses it."""
+def test_temperatures_are_scheduled():
+    """By assignment or a scheduler; the next call uses them. One may be 0 where one is learned."""
     loss, *_ = _trained(delay_actor=True)
     for name in ("tau", "tau_prime"):
         before = call(loss, _batch())["loss_actor"]
-        buffer = getattr(loss, name)
         setattr(loss, name, 2)
-        assert getattr(loss, name) is buffer
-        assert dict(loss.named_buffers())[name] is buffer
-        assert (buffer.item(), buffer.dtype, buffer.shape) == (2.0, torch.float64, torch.Size([]))
         outputs = call(loss, _batch())
         assert not torch.allclose(outputs["loss_actor"], before)
         assert outputs[name] == 2.0
@@ -1004,45 +936,9 @@ def test_temperatures_are_scheduled_by_assignment():
         assert loss.tau_prime == expected
         scheduler.step(5)
     assert call(loss, _batch())["loss_actor"].isfinite()
-
-
-@pytest.mark.parametrize("name", ["tau", "tau_prime"])
-@pytest.mark.parametrize(
-    ("bad", "message"),
-    [
-        (-0.1, "a finite number >= 0, got"),
-        (math.nan, "a finite number >= 0, got"),
-        (math.inf, "a finite number >= 0, got"),
-        (torch.tensor(math.nan), "a finite number >= 0, got"),
-        ("a", "a number, got 'a'"),
-        (None, "a number, got None"),
-        (torch.ones(2), "a number, got tensor"),
-    ],
-    ids=str,
-)
-def test_bad_temperatures_are_refused(name, bad, message):
-    """At the door and when they are set: then the old one stays."""
-    with pytest.raises(ValueError, match=f"{name} must be {message}"):
-        CASE.build(**{name: bad})
-    loss = CASE.build()
-    with pytest.raises(ValueError, match=f"{name} must be {message}"):
-        setattr(loss, name, bad)
-    assert getattr(loss, name).item() == getattr(CASE, name)
-    assert isinstance(dict(loss.named_buffers())[name], torch.Tensor)
-
-
-def test_some_regularisation_there_must_be():
-    """One of two temperatures may be 0; not both, also where one is scheduled."""
-    message = r"tau \+ tau_prime must be positive, got 0.*Set a temperature above 0"
-    for zero, other in (("tau", "tau_prime"), ("tau_prime", "tau")):
-        loss = CASE.build(**{zero: 0.0})
-        assert call(loss, _batch())["loss_actor"].isfinite()
-        with pytest.raises(ValueError, match=message):
-            setattr(loss, other, 0.0)
-        assert getattr(loss, other).item() == getattr(CASE, other)
-    with pytest.raises(ValueError, match=message):
-        CASE.build(tau=0.0, tau_prime=0.0)
-    loss = CASE.build(target_entropy=-1.0)  # tau_prime is learned, so positive
+    with pytest.raises(ValueError, match=r"tau \+ tau_prime must be positive, got 0"):
+        loss.tau = 0.0
+    loss = CASE.build(target_entropy=-1.0)
     loss.tau = 0
     assert call(loss, _batch())["tau"] == 0
     with pytest.raises(ValueError, match="tau must be a finite number"):
@@ -1206,9 +1102,6 @@ def test_policies_of_another_kind(case):
     ):
         with pytest.raises(ValueError, match=message):
             case.build(networks)(_batch(case))
-    networks.actor = other[0]
-    with pytest.raises(TypeError, match="actor_network must have a get_dist method"):
-        case.build(networks)
 
 
 @pytest.mark.parametrize(
@@ -1218,7 +1111,6 @@ def test_policies_of_another_kind(case):
         (("next", "done"), torch.zeros(6).bool(), r"have the shape \(6, 1\) of the reward"),
         (("next", "terminated"), torch.zeros(6).bool(), r"have the shape \(6, 1\) of the reward"),
         (MASK, torch.ones(5).bool(), r"have the shape \(6,\).*got \(5,\)"),
-        (MASK, torch.ones(6), "be boolean.*got torch.float32"),
     ],
     ids=str,
 )
@@ -1311,14 +1203,6 @@ def test_values_that_are_not_finite(case, key, message):
 
 
 @losses
-def test_networks_that_have_diverged(case):
-    networks = make_networks(case.kind)
-    networks.qvalues[1].module[-1].bias.data.fill_(math.nan)  # type: ignore
-    with pytest.raises(ValueError, match=r"is NaN or infinite in \d+ of \d+ places. Mend"):
-        case.build(networks)(_batch(case))
-
-
-@losses
 def test_missing_entries_are_named(case):
     """With a tensordict and without one."""
     loss, batch = case.build(), _batch(case)
@@ -1363,20 +1247,6 @@ def test_extremes_stay_finite(case, scale, value, dtype):
         assert gradient.isfinite().all(), name
     assert outputs["ESS"] >= 1 - 1e-5
     assert batch["td_error"].isfinite().all()
-
-
-@pytest.mark.parametrize("name", ["ecac", "pmd_ac"])
-def test_saturated_actions(name, dtype):
-    """Where tanh is 1 to the last digit the log-probability is still that of the latent."""
-    case, networks = CASES[name], make_networks(dtype=dtype)
-    networks.actor[0].module[0].bias.data[:ACTION] = 40.0  # type: ignore
-    loss = case.build(networks, delay_actor=True)
-    outputs = call(loss, _batch(case, dtype=dtype))
-    assert outputs["saturation"] == 1.0
-    assert all(output.isfinite() for output in outputs.values())
-    # -log of (1 - tanh^2) at 40 is about 80 - log 4, in each of two dimensions
-    assert -200 < outputs["entropy"] < -100
-    assert all(g.isfinite().all() for g in gradients(loss, total(outputs)).values())
 
 
 # ----------------------------------------------------------------------------------------- compile
