@@ -282,39 +282,25 @@ def test_delay_flags(value, delay_actor, delay_qvalue):
 
 
 @losses
-def test_updaters(case):
+@pytest.mark.parametrize("stock", [False, True], ids=["sequence", "SoftUpdate"])
+def test_updaters(case, stock):
     """Each delayed network follows its own updater; TorchRL's takes all of them."""
     critic = "value_network" if case.value else "qvalue_network"
-    new = make_networks(case.kind, seed=2)
-
-    def distances(loss):
-        return {
-            name: sum(
-                (source - getattr(loss, f"target_{name}_params").get(key)).abs().sum().item()
-                for key, source in getattr(loss, f"{name}_params").data.items(True, True)
-            )
-            for name in ("actor_network", critic)
-        }
-
     loss = case.build(delay_actor=True, updater=False)
-    updater = UpdaterSequence(
-        PeriodicCopy(loss, "actor_network", interval=2), PolyakAverage(loss, critic, weight=0.25)
-    )
+    if stock:
+        updater = SoftUpdate(loss, eps=0.75)
+    else:
+        of_actor = PeriodicCopy(loss, "actor_network", interval=1)
+        updater = UpdaterSequence(of_actor, PolyakAverage(loss, critic, weight=0.25))
     call(loss, _batch(case))  # without a warning
-    become(loss, new)
-    before = distances(loss)
+    become(loss, make_networks(case.kind, seed=2))
+    expected = {}
+    for name, share in (("actor_network", 0.25 if stock else 1.0), (critic, 0.25)):
+        source, target = (getattr(loss, f"{x}{name}_params").data for x in ("", "target_"))
+        expected[name] = (target, target.lerp(source, share))
     updater.step()
-    after = distances(loss)
-    assert after["actor_network"] == before["actor_network"] > 0
-    assert after[critic] == pytest.approx(0.75 * before[critic])
-    updater.step()
-    assert distances(loss)["actor_network"] == 0
-
-    loss = case.build(delay_actor=True, updater=False)
-    updater = SoftUpdate(loss, eps=0.75)
-    become(loss, new)
-    updater.step()
-    assert distances(loss) == pytest.approx({name: 0.75 * d for name, d in before.items()})
+    for target, moved in expected.values():
+        assert_close(target, moved)
 
 
 # -------------------------------------------------------------------------------------- the module
@@ -503,7 +489,7 @@ def test_default_keys(case):
 def test_set_keys(case, names):
     """Every field, where all have other names; None restores the defaults."""
     batch = _batch(case)
-    reference = case.build(value=True)
+    reference = case.build()
     unweighted = call(reference, batch)
     batch["priority_weight"] = WEIGHTS
     expected = call(reference, batch)
@@ -515,7 +501,7 @@ def test_set_keys(case, names):
         places[field] = (*place[:-1], *((key,) if isinstance(key, str) else key))
         if field != "priority":
             renamed[places[field]] = batch[place]
-    loss = case.build(_renamed_networks(case, keys), value=True)
+    loss = case.build(_renamed_networks(case, keys))
     assert loss.in_keys
     assert loss.set_keys(**keys) is None
     assert vars(loss.tensor_keys) == keys
@@ -917,6 +903,8 @@ def test_num_actor_states(case, n):
     assert_close(actual["loss_qvalue"], whole["loss_qvalue"])
     assert_close(actual.exclude("loss_qvalue"), first.exclude("loss_qvalue"))
     assert batch["td_error"].shape == (6,)
+    with pytest.raises(ValueError, match=f"num_actor_states={n} takes the first of a batch"):
+        case.build(**options, num_actor_states=n)(batch[0])
 
 
 # ------------------------------------------------------------------------------------ temperatures
@@ -1214,12 +1202,6 @@ def test_missing_entries_are_named(case):
         del keywords["_".join(key) if isinstance(key, tuple) else key]
         with pytest.raises(KeyError, match=f"{name} is missing"):
             loss(**keywords)
-
-
-def test_the_first_states_of_a_single_transition_are_refused():
-    loss = CASE.build(num_actor_states=4)
-    with pytest.raises(ValueError, match="num_actor_states=4 takes the first of a batch"):
-        loss(_batch()[0])
 
 
 # --------------------------------------------------------------------------------------- extremes

@@ -357,20 +357,6 @@ def test_discrete_lift_and_losses_by_hand():
 
 
 @TEMPERATURES
-def test_discrete_uniform_reference(tau, tau_prime):
-    """Weights softmax(Q / (tau + tau')), value that of Q's log-sum-exp less tau log n."""
-    score = [[0.3, -0.2, 1.0], [0.0, 0.0, 0.0]]
-    loss = tabular([[0.0] * 3] * 2, score, tau=tau, tau_prime=tau_prime)
-    batch = transition(0, 1, 0.0, 1)
-    lift = lifted(loss, batch.select("observation"), 0)
-    total = tau + tau_prime
-    score = torch.tensor(score[0], dtype=torch.float64)
-    assert_close(lift.weights[:, 0], (score / total).softmax(0))
-    expected = total * (score / total).logsumexp(0) - tau * math.log(3)
-    assert_close(lift.value[0], expected)
-
-
-@TEMPERATURES
 def test_discrete_gradient_is_policy_minus_target(tau, tau_prime):
     """With respect to the logits; at a delayed reference as well as at the policy itself."""
     networks = make_networks("categorical")
