@@ -896,6 +896,8 @@ def test_num_actor_states(case, n):
     """All but the Q networks learn from the first n states; Q learns from all."""
     options = {"delay_actor": False, **LEARNED}
     batch = _batch(case)
+    batch["priority_weight"] = WEIGHTS
+    batch[MASK] = torch.arange(6) != 2
     with _SharedNoise():
         actual = case.build(**options, num_actor_states=n)(batch)
         whole = case.build(**options)(batch)
@@ -904,7 +906,7 @@ def test_num_actor_states(case, n):
     assert_close(actual.exclude("loss_qvalue"), first.exclude("loss_qvalue"))
     assert batch["td_error"].shape == (6,)
     with pytest.raises(ValueError, match=f"num_actor_states={n} takes the first of a batch"):
-        case.build(**options, num_actor_states=n)(batch[0])
+        case.build(**options, num_actor_states=n)(_batch(case)[0])
 
 
 # ------------------------------------------------------------------------------------ temperatures
