@@ -30,6 +30,8 @@ from torchrl_ecpo import (
 )
 
 ACTION, CHOICES, GAMMA = 2, 4, 0.9
+FIXED = {"target_kl": None, "target_entropy": None}
+LEARNED = {"target_kl": 0.05, "target_entropy": -1.5}
 
 # ------------------------------------------------------------------------------------ the networks
 
@@ -102,6 +104,7 @@ class Case:
     loss: type[ActorCriticLoss]
     kind: str
     options: dict[str, Any] = field(default_factory=dict)
+    value: bool = False
     tau: float = 0.75
     tau_prime: float = 0.25
 
@@ -109,32 +112,23 @@ class Case:
     def is_discrete(self) -> bool:
         return self.kind in DISCRETE
 
-    @property
-    def learned(self) -> dict[str, float]:
-        """What makes both temperatures learned."""
-        return {"target_kl": 0.05, "target_entropy": -1.5}
-
     def build(
         self,
         networks: Networks | None = None,
         *,
-        value: bool = False,
+        value: bool | None = None,
         updater: bool = True,
         **options: Any,
     ) -> ActorCriticLoss:
         """In the dtype of the networks; temperatures are fixed unless options say otherwise."""
         networks = make_networks(self.kind) if networks is None else networks
-        defaults = {
-            "tau": self.tau,
-            "tau_prime": self.tau_prime,
-            "target_kl": None,
-            "target_entropy": None,
-        }
+        has_value = self.value if value is None else value
+        temperatures = {"tau": self.tau, "tau_prime": self.tau_prime}
         loss = self.loss(
             networks.actor,
             networks.qvalues,
-            networks.value if value else None,
-            **{**defaults, **self.options, **options},
+            networks.value if has_value else None,
+            **{**temperatures, **FIXED, **self.options, **options},
         )
         loss.make_value_estimator(gamma=GAMMA)
         loss.to(next(networks.actor.parameters()).dtype)
@@ -149,30 +143,15 @@ CASES = {
     "discrete_ecac": Case(DiscreteECACLoss, "categorical"),
     "discrete_pmd_ac": Case(DiscretePMDACLoss, "one_hot"),
 }
-CONTINUOUS = ("ecac", "pmd_ac")
-
-METRICS = [
-    "ESS",
-    "kl_target_reference",
-    "kl_reference_policy",
-    "entropy",
-    "saturation",
-    "qvalue",
-    "state_value",
-]
 
 
 def out_keys(case: Case, *, value: bool, learned: bool = False) -> list[str]:
     """As documented."""
-    return [
-        "loss_actor",
-        "loss_qvalue",
-        *(["loss_value"] if value else []),
-        *(["loss_tau", "loss_tau_prime"] if learned else []),
-        *(name for name in METRICS if not (case.is_discrete and name == "saturation")),
-        "tau",
-        "tau_prime",
-    ]
+    losses = ["loss_actor", "loss_qvalue", *(["loss_value"] if value else [])]
+    losses += ["loss_tau", "loss_tau_prime"] if learned else []
+    metrics = ["ESS", "kl_target_reference", "kl_reference_policy", "entropy"]
+    metrics += [] if case.is_discrete else ["saturation"]
+    return [*losses, *metrics, "qvalue", "state_value", "tau", "tau_prime"]
 
 
 def total(losses: TensorDictBase) -> Tensor:
@@ -238,8 +217,14 @@ def make_batch(
 
 
 def as_keywords(loss: ActorCriticLoss, batch: TensorDictBase) -> dict[str, Tensor]:
-    """The keywords of a call without a tensordict."""
+    """The keywords of a call without a tensordict: the in_keys, joined by _."""
     return {"_".join((key,) if isinstance(key, str) else key): batch[key] for key in loss.in_keys}
+
+
+def call_by_keywords(loss: ActorCriticLoss, batch: TensorDictBase, seed: int = 0) -> Any:
+    """As :func:`call`, without a tensordict: the outputs in the order of the out_keys."""
+    torch.manual_seed(seed)
+    return loss(**as_keywords(loss, batch))
 
 
 # ------------------------------------------------------------------------------ in plain numbers
