@@ -42,7 +42,7 @@ from utils import (  # noqa: E402 # pyright: ignore[reportMissingImports]
 
 def compose_run(env: str, level: int | None, seed: int) -> Any:
     """The configuration of a run."""
-    options = [f"env={env}", f"seed={seed}", "logger.backend=none"]
+    options = [f"env={env}", f"seed={seed}"]
     if level:
         options.append("optim.lr=1e-9")
     with initialize_config_dir(str(SCRIPT / "config"), version_base="1.3"):

@@ -95,11 +95,8 @@ def test_other_loggers_come_beside_the_record(tmp_path, backend, monkeypatch):
     assert read_metrics(tmp_path)["return"] == [1, 2, 4]
 
 
-def test_no_logger_leaves_no_record_but_a_picture(tmp_path):
-    with make_run(tmp_path, make_config("none")) as run:
-        record(run)
-    assert (tmp_path / "curve.png").exists()
-    with pytest.raises(FileNotFoundError, match=r"no metrics\.csv in .*logger\.backend"):
+def test_a_folder_without_a_record_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no metrics\.csv in .*directory of a run"):
         read_metrics(tmp_path)
 
 

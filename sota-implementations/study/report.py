@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from manifest import SCRIPTS, Cell, Manifest, Study, argument_parser, read_manifests
+from matplotlib.figure import Figure
 from results import RESULTS, Point, Results, recorded
 from scores import (
     Estimate,
@@ -25,7 +26,7 @@ from scores import (
 )
 
 from torchrl_ecpo.experiment.compare import Curve, align
-from torchrl_ecpo.experiment.figures import plot_comparison, plot_heat_map
+from torchrl_ecpo.experiment.figures import plot_comparison, save_figure
 
 DOCS = SCRIPTS.parent / "docs"
 BEST = 3  # settings of a search that are listed
@@ -376,6 +377,47 @@ def heat_maps(study: Study, cells: Sequence[CellResult], docs: Path) -> str:
         for metric in (group[0].cell.task.metric, *study.also)
         if any(result.curve(metric) is not None for result in group)
     )
+
+
+def plot_heat_map(
+    values: np.ndarray,
+    path: Path,
+    *,
+    title: str,
+    x_axis: tuple[str, Sequence[str]],
+    y_axis: tuple[str, Sequence[str]],
+    texts: np.ndarray,
+) -> Path:
+    """Draw a number for each pair of settings; return ``path``.
+
+    Args:
+        values: ``[y, x]``; NaN where there is none.
+        path: of the picture; its ending is its format.
+        title: of the picture.
+        x_axis: name and settings of the columns.
+        y_axis: name and settings of the rows.
+        texts: ``[y, x]``, what is written in each field.
+    """
+    figure = Figure(figsize=(1.6 + 1.1 * len(x_axis[1]), 1.4 + 0.8 * len(y_axis[1])))
+    figure.set_layout_engine("constrained")
+    panel = figure.subplots()
+    image = panel.imshow(values, origin="lower", aspect="auto", cmap="viridis")
+    panel.set_xticks(range(len(x_axis[1])), x_axis[1])
+    panel.set_yticks(range(len(y_axis[1])), y_axis[1])
+    panel.set(xlabel=x_axis[0], ylabel=y_axis[0], title=title)
+    brightest_with_white = np.nanmin(values) + 0.6 * np.ptp(values[np.isfinite(values)])
+    for (row, column), value in np.ndenumerate(values):
+        panel.text(
+            column,
+            row,
+            str(texts[row, column]),
+            ha="center",
+            va="center",
+            # On the bright end of the scale, and on the white of what is missing.
+            color="white" if value < brightest_with_white else "black",
+        )
+    figure.colorbar(image, ax=panel)
+    return save_figure(figure, path)
 
 
 def heat_map(study: Study, group: Sequence[CellResult], docs: Path, metric: str) -> str:

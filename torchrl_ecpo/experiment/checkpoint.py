@@ -26,7 +26,6 @@ from torchrl.checkpoint import (
     StateDictCheckpointAdapter,
 )
 
-from torchrl_ecpo.checks import check_count
 from torchrl_ecpo.experiment.run import Run, differences, flatten
 
 __all__ = ["Checkpoints", "Progress"]
@@ -74,13 +73,11 @@ class Checkpoints:
         directory: of the run.
 
     Raises:
-        ValueError: for options that make no sense.
         CheckpointError: if there is nothing to resume from, if it is no checkpoint of such a run,
             or if the configuration is not the checkpoint's.
     """
 
     def __init__(self, config: DictConfig, directory: Path | str = ".") -> None:
-        _check_options(config.checkpoint)
         self.options, self.resume = config.checkpoint, config.resume
         self.directory = Path(directory).resolve()
         folder = self.directory / FOLDER
@@ -163,7 +160,7 @@ class Checkpoints:
             if left_out and metadata["step"] < self.config[f"total_{self.run.unit}"]:
                 raise CheckpointError(
                     f"{source} is that of a run which had finished, and has no "
-                    f"{', '.join(left_out)}: begin a longer run anew, without resume."
+                    f"{', '.join(left_out)}: begin a longer run without resume."
                 )
         try:
             # What is rebuilt may draw random numbers, so their generators come last.
@@ -301,15 +298,6 @@ def run_directory(resume: str | None, parent: str, name: str) -> str:
 
 
 OmegaConf.register_new_resolver("run_directory", run_directory, replace=True)
-
-
-def _check_options(options: DictConfig) -> None:
-    interval, max_share = options.interval, options.max_share
-    check_count("checkpoint.keep", options.keep)
-    if interval is not None and not (isinstance(interval, (int, float)) and interval >= 0):
-        raise ValueError(f"checkpoint.interval must be seconds or null, got {interval!r}.")
-    if not isinstance(max_share, (int, float)) or not 0 < max_share <= 1:
-        raise ValueError(f"checkpoint.max_share must lie in (0, 1], got {max_share!r}.")
 
 
 def _differences(saved: dict[str, Any], present: dict[str, Any]) -> list[str]:

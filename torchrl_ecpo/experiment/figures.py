@@ -15,8 +15,8 @@ from matplotlib.ticker import EngFormatter
 __all__ = [
     "draw_curve",
     "plot_comparison",
-    "plot_heat_map",
     "plot_learning_curve",
+    "save_figure",
     "smooth",
 ]
 
@@ -113,7 +113,7 @@ def plot_comparison(
         panel.set_ylabel(y_label)
     for panel in axes[len(panels) :]:
         panel.set_visible(False)
-    return _save(figure, path)
+    return save_figure(figure, path)
 
 
 def draw_curve(
@@ -136,47 +136,6 @@ def draw_curve(
         panel.fill_between(steps, mean - error, mean + error, color=color, alpha=0.2, lw=0)
 
 
-def plot_heat_map(
-    values: np.ndarray,
-    path: Path,
-    *,
-    title: str,
-    x_axis: tuple[str, Sequence[str]],
-    y_axis: tuple[str, Sequence[str]],
-    texts: np.ndarray,
-) -> Path:
-    """Draw a number for each pair of settings; return ``path``.
-
-    Args:
-        values: ``[y, x]``; NaN where there is none.
-        path: of the picture; its ending is its format.
-        title: of the picture.
-        x_axis: name and settings of the columns.
-        y_axis: name and settings of the rows.
-        texts: ``[y, x]``, what is written in each field.
-    """
-    figure = Figure(figsize=(1.6 + 1.1 * len(x_axis[1]), 1.4 + 0.8 * len(y_axis[1])))
-    figure.set_layout_engine("constrained")
-    panel = figure.subplots()
-    image = panel.imshow(values, origin="lower", aspect="auto", cmap="viridis")
-    panel.set_xticks(range(len(x_axis[1])), x_axis[1])
-    panel.set_yticks(range(len(y_axis[1])), y_axis[1])
-    panel.set(xlabel=x_axis[0], ylabel=y_axis[0], title=title)
-    brightest_with_white = np.nanmin(values) + 0.6 * np.ptp(values[np.isfinite(values)])
-    for (row, column), value in np.ndenumerate(values):
-        panel.text(
-            column,
-            row,
-            str(texts[row, column]),
-            ha="center",
-            va="center",
-            # On the bright end of the scale, and on the white of what is missing.
-            color="white" if value < brightest_with_white else "black",
-        )
-    figure.colorbar(image, ax=panel)
-    return _save(figure, path)
-
-
 def _colours(methods: Collection[str]) -> dict[str, str]:
     """A colour for each method: its own, or else the next that is free, as long as there are."""
     taken = {METHOD_COLOURS.get(method.lower()) for method in methods}
@@ -184,7 +143,7 @@ def _colours(methods: Collection[str]) -> dict[str, str]:
     return {method: METHOD_COLOURS.get(method.lower()) or next(others) for method in methods}
 
 
-def _save(figure: Figure, path: Path) -> Path:
+def save_figure(figure: Figure, path: Path) -> Path:
     """Write a picture that depends on what it shows alone: no date, no random names."""
     with matplotlib.rc_context({"svg.hashsalt": "torchrl_ecpo"}):
         figure.savefig(path, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)

@@ -27,7 +27,7 @@ from torchrl_ecpo.experiment.figures import plot_learning_curve
 __all__ = ["METRICS_FILE", "MetricsTable", "Run", "check_options", "read_metrics"]
 
 METRICS_FILE = "metrics.csv"
-BACKENDS = ("csv", "tensorboard", "wandb", "none")
+BACKENDS = ("csv", "tensorboard", "wandb")
 RECORDED_PACKAGES = ("torchrl-ecpo", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
 
 Metrics = Mapping[str, float | Tensor]
@@ -38,7 +38,8 @@ def check_options(config: DictConfig, counts: Sequence[str]) -> None:
 
     Args:
         config: of the run.
-        counts: names of options that must be integers of at least 1, beside ``threads``.
+        counts: names of options that must be integers of at least 1, beside ``threads`` and
+            ``checkpoint.keep``.
 
     Raises:
         ValueError: naming the option, what was expected, and what came.
@@ -50,12 +51,17 @@ def check_options(config: DictConfig, counts: Sequence[str]) -> None:
             ...
         ValueError: size.k must be an integer of at least 1, got 0.
     """
-    for name in (*counts, "threads"):
+    for name in (*counts, "threads", "checkpoint.keep"):
         check_count(name, OmegaConf.select(config, name))
     if not isinstance(config.seed, int):
         raise ValueError(f"seed must be an integer, got {config.seed!r}.")
     if not isinstance(config.compile, bool):
         raise ValueError(f"compile must be true or false, got {config.compile!r}.")
+    interval, max_share = config.checkpoint.interval, config.checkpoint.max_share
+    if interval is not None and not (isinstance(interval, (int, float)) and interval >= 0):
+        raise ValueError(f"checkpoint.interval must be seconds or null, got {interval!r}.")
+    if not isinstance(max_share, (int, float)) or not 0 < max_share <= 1:
+        raise ValueError(f"checkpoint.max_share must lie in (0, 1], got {max_share!r}.")
 
 
 class MetricsTable:
@@ -65,17 +71,18 @@ class MetricsTable:
     to commit and to continue as one table.
 
     Args:
-        path: of the csv file; None keeps the rows in memory only.
+        path: of the csv file.
 
     Examples:
-        >>> table = MetricsTable(None)
+        >>> import tempfile
+        >>> table = MetricsTable(Path(tempfile.mkdtemp(), "metrics.csv"))
         >>> table.log_metrics({"return": 1.0}, step=10)
         >>> table.log_metrics({"return": 2.0, "evaluation": 3.0}, step=20)
         >>> table.rows
         [{'step': 10, 'return': 1.0}, {'step': 20, 'return': 2.0, 'evaluation': 3.0}]
     """
 
-    def __init__(self, path: Path | None) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.rows: list[dict[str, float]] = []
         self._columns: list[str] = []
@@ -84,8 +91,6 @@ class MetricsTable:
         """Append a row. A new column rewrites the file, with empty cells in earlier rows."""
         row = {"step": step, **metrics}
         self.rows.append(row)
-        if self.path is None:
-            return
         if any(name not in self._columns for name in row):
             self._rewrite()
             return
@@ -93,8 +98,7 @@ class MetricsTable:
             csv.DictWriter(file, self._columns).writerow(row)
 
     def _rewrite(self) -> None:
-        """Write all rows anew, so that a run which is killed meanwhile loses none."""
-        assert self.path is not None
+        """Write all rows to another file, so that a run which is killed meanwhile loses none."""
         self._columns = list(dict.fromkeys(name for row in self.rows for name in row))
         written = self.path.with_suffix(".part")
         with written.open("w", newline="") as file:
@@ -109,8 +113,6 @@ class MetricsTable:
         Raises:
             ValueError: if the file does not reach to that step.
         """
-        if self.path is None:
-            return
         self.rows = []
         if self.path.is_file():
             with self.path.open(newline="") as file:
@@ -139,8 +141,7 @@ def read_metrics(run_directory: Path | str) -> dict[str, list[float]]:
     path = Path(run_directory) / METRICS_FILE
     if not path.is_file():
         raise FileNotFoundError(
-            f"There is no {METRICS_FILE} in {run_directory}: is it the directory of a run, and was "
-            "the run made with a logger.backend other than 'none'?"
+            f"There is no {METRICS_FILE} in {run_directory}: is it the directory of a run?"
         )
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -157,8 +158,8 @@ class Run:
 
     Args:
         config: the composed configuration; needs ``seed`` and ``logger`` with ``backend``
-            (``csv``: the record alone; ``tensorboard`` or ``wandb``: that too; ``none``: not
-            even the record), ``project`` and ``wandb_mode``.
+            (``csv``: the record alone; ``tensorboard`` or ``wandb``: that too), ``project`` and
+            ``wandb_mode``.
 
     Keyword Args:
         total: number of steps of the run, for the progress bar.
@@ -185,8 +186,7 @@ class Run:
         show_bar: bool = True,
         stack_size: int = 1,
     ) -> None:
-        backend = config.logger.backend or "none"
-        check_choice("logger.backend", backend, BACKENDS)
+        check_choice("logger.backend", config.logger.backend, BACKENDS)
         self.name, self.unit, self.shown = name, unit, shown
         self.directory = Path(directory).resolve()
         self.stack_size = stack_size
@@ -196,8 +196,8 @@ class Run:
         OmegaConf.save(config, self.directory / "config.yaml.part", resolve=True)
         os.replace(self.directory / "config.yaml.part", self.directory / "config.yaml")
         _write_json(self.directory / "versions.json", _versions())
-        self.table = MetricsTable(None if backend == "none" else self.directory / METRICS_FILE)
-        self._logger = self._make_logger(config, backend)
+        self.table = MetricsTable(self.directory / METRICS_FILE)
+        self._logger = None if config.logger.backend == "csv" else self._make_logger(config)
         self._bar = tqdm(
             total=total,
             unit=f" {unit}",
@@ -208,11 +208,9 @@ class Run:
         )
         self._started = time.monotonic()
 
-    def _make_logger(self, config: DictConfig, backend: str) -> Logger | None:
-        if backend not in ("tensorboard", "wandb"):
-            return None
+    def _make_logger(self, config: DictConfig) -> Logger:
         logger = get_logger(
-            backend,
+            config.logger.backend,
             logger_name=str(self.directory),
             experiment_name=self.name.replace("/", "_"),
             wandb_kwargs={"project": config.logger.project, "mode": config.logger.wandb_mode},
