@@ -244,32 +244,30 @@ class TestErrors:
     @pytest.mark.parametrize(
         ("make_loss", "networks", "message"),
         [
-            (lambda: nn.Linear(1, 1), (), "must be a torchrl LossModule, got Linear"),
+            (lambda: nn.Linear(1, 1), (), "must be a LossModule, got Linear"),
             (
                 sac,
                 ("actor",),
-                "SACLoss has no network 'actor'; its delayed networks: "
+                "['actor'] of SACLoss: its delayed networks are "
                 "['actor_network', 'qvalue_network']",
             ),
             (
                 lambda: sac(delay_actor=False),
                 ("actor_network",),
-                "'actor_network' of SACLoss has no delayed parameters. Build the loss with "
-                "delay_actor=True.",
+                "['actor_network'] of SACLoss: its delayed networks are ['qvalue_network']",
             ),
             (
                 lambda: ddpg(delay_actor=False, delay_value=False),
                 (),
-                "DDPGLoss has no delayed networks. Build the loss with delay_actor=True or "
-                "delay_value=True.",
+                "a network of DDPGLoss: its delayed networks are []. A network is delayed by an "
+                "argument of the loss, such as delay_actor=True",
             ),
             (
                 reinforce,
                 ("critic_network",),
-                "'critic_network' of ReinforceLoss has no delayed parameters. Build the loss with "
-                "delay_value=True.",
+                "['critic_network'] of ReinforceLoss: its delayed networks are []",
             ),
-            (sac, ("actor_network", "actor_network"), "'actor_network' is named twice"),
+            (sac, ("actor_network", "actor_network"), "A network is named twice"),
         ],
     )
     def test_networks(self, make_loss, networks, message):

@@ -48,7 +48,6 @@ with its own. Building an updater copies the networks, so build first and load b
 
 from __future__ import annotations
 
-import inspect
 import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -63,7 +62,7 @@ __all__ = ["PeriodicCopy", "PolyakAverage", "UpdaterSequence"]
 
 
 class _NetworkUpdater(TargetNetUpdater):
-    """A :class:`~torchrl.objectives.TargetNetUpdater` of the named networks of a loss only.
+    """An updater of the named networks of a loss only.
 
     A subclass says in ``_step`` what one call does to one tensor. TorchRL's constructor takes every
     target of the loss. Its ``init_`` and ``step`` keep a collection of the tensors that required a
@@ -72,13 +71,11 @@ class _NetworkUpdater(TargetNetUpdater):
     """
 
     option: str
-    """The name of the subclass's option."""
+    """The name of the subclass's option, for ``repr``."""
 
     def __init__(self, loss_module: LossModule, *networks: str) -> None:
         if not isinstance(loss_module, LossModule):
-            raise ValueError(
-                f"loss_module must be a torchrl LossModule, got {type(loss_module).__name__}."
-            )
+            raise ValueError(f"loss_module must be a LossModule, got {type(loss_module).__name__}.")
         self.loss_module = loss_module
         self.networks = _delayed_networks(loss_module, networks)
         with warnings.catch_warnings():
@@ -91,11 +88,7 @@ class _NetworkUpdater(TargetNetUpdater):
         """Copies the networks into their delayed parameters, now.
 
         The constructor does this. Call it again after ``loss.reset_parameters_recursive()``, which
-        draws different values for a network and for its delayed copy. Unlike that of TorchRL's
-        updaters, a second call does not warn.
-
-        Raises:
-            RuntimeError: if delayed parameters require a gradient.
+        draws different values for a network and for its delayed copy.
         """
         for source, target in self._pairs():
             target.copy_(source)
@@ -158,8 +151,8 @@ class PeriodicCopy(_NetworkUpdater):
     This is how a reference policy moves from one lift to the next: it stands still for N gradient
     steps while the policy is projected, then becomes the policy. Calls N, 2N, 3N, ... copy, exactly
     (TorchRL's ``HardUpdate(loss, value_network_update_interval=N)`` copies on every (N+1)-th call).
-    Parameters and buffers are copied in place; dtype, device and absence of gradients stay. There
-    is an example at the head of :mod:`torchrl_ecpo.updaters`.
+    Parameters and buffers are copied in place. There is an example at the head of
+    :mod:`torchrl_ecpo.updaters`.
 
     Args:
         loss_module: any loss with delayed networks.
@@ -315,37 +308,19 @@ class UpdaterSequence(TargetNetUpdater):
 
 def _delayed_networks(loss_module: LossModule, networks: tuple[str, ...] = ()) -> tuple[str, ...]:
     """Checks the names against the delayed networks of the loss; all of them if none is named."""
-    loss = type(loss_module).__name__
-    known = list(networks_with_updater(loss_module))
     children = dict(loss_module.named_children())
-    delayed = [name for name in known if f"target_{name}_params" in children]
-    if not networks and not delayed:
-        raise ValueError(f"{loss} has no delayed networks. {_how_to_delay(loss_module)}")
-    for name in networks:
-        if name not in known:
-            raise ValueError(f"{loss} has no network {name!r}; its delayed networks: {delayed}.")
-        if name not in delayed:
-            raise ValueError(
-                f"The network {name!r} of {loss} has no delayed parameters. "
-                f"{_how_to_delay(loss_module, name)}"
-            )
-        if networks.count(name) > 1:
-            raise ValueError(f"The network {name!r} is named twice.")
-    return networks or tuple(delayed)
-
-
-def _how_to_delay(loss_module: LossModule, network: str = "") -> str:
-    """Names the ``delay_*`` flag of a network where it has one, else the flags that there are."""
-    parameters = {
-        name: None  # in their order
-        for base in type(loss_module).__mro__
-        for name in inspect.signature(base.__init__).parameters
-    }
-    own = f"delay_{network.removesuffix('_network')}"
-    flags = [own] if own in parameters else [n for n in parameters if n.startswith("delay_")]
-    if not flags:
-        return "This loss has no delay_* flag."
-    return "Build the loss with " + " or ".join(f"{flag}=True" for flag in flags) + "."
+    known = networks_with_updater(loss_module)
+    delayed = tuple(name for name in known if f"target_{name}_params" in children)
+    others = [name for name in networks if name not in delayed]
+    if others or not delayed:
+        raise ValueError(
+            f"No updater can follow {others or 'a network'} of {type(loss_module).__name__}: its "
+            f"delayed networks are {list(delayed)}. A network is delayed by an argument of the "
+            "loss, such as delay_actor=True or delay_value=True."
+        )
+    if len(set(networks)) < len(networks):
+        raise ValueError(f"A network is named twice: {list(networks)}.")
+    return networks or delayed
 
 
 def _owners(updaters: tuple[TargetNetUpdater, ...]) -> dict[str, TargetNetUpdater]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -37,6 +36,7 @@ __all__ = [
 
 HIDDEN_SIZES = (256, 256)
 LOG_SCALE_BOUNDS = (-5.0, 2.0)
+"""Of the Gaussian before tanh: 2 is SAC's, its -20 is never reached; e^-5 acts like no scale."""
 NARROW = 32
 """So many numbers are multiplied as fast for each sample as once."""
 
@@ -90,7 +90,7 @@ class DenseNetwork(TensorDictModuleBase):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Draw all parameters anew, as ``torch.nn.Linear`` does: uniform up to 1/sqrt(fan-in).
+        """Draw all parameters as ``torch.nn.Linear`` does: uniform up to 1/sqrt(fan-in).
 
         Those of the last layer: times ``final_gain``.
         """
@@ -181,28 +181,13 @@ def _is_repeated(x: Tensor) -> bool:
     return is_worth_it and not x.requires_grad and not is_transformed()
 
 
-def _loc_and_scale(
-    output: Tensor, log_scale_bounds: tuple[float, float] = LOG_SCALE_BOUNDS
-) -> tuple[Tensor, Tensor]:
-    """Split a network's output into the location and the scale of a Gaussian.
+def _loc_and_scale(output: Tensor) -> tuple[Tensor, Tensor]:
+    """Split a network's output ``[..., 2 * A]`` into the location and the scale of a Gaussian.
 
-    The second half of the output is the logarithm of the scale, cut off at the bounds. An untrained
-    network, whose outputs are near 0, gives a scale of about 1.
-
-    Args:
-        output: ``[..., 2 * A]``.
-        log_scale_bounds: the least and the greatest logarithm of the scale.
-
-    Returns:
-        Location and scale, ``[..., A]`` each.
-
-    Examples:
-        >>> import torch
-        >>> _loc_and_scale(torch.tensor([0.5, -0.5, 0.0, 9.0]))
-        (tensor([ 0.5000, -0.5000]), tensor([1.0000, 7.3891]))
+    An untrained network, whose outputs are near 0, gives a scale of about 1.
     """
     loc, log_scale = output.chunk(2, -1)
-    return loc, log_scale.clamp(*log_scale_bounds).exp()
+    return loc, log_scale.clamp(*LOG_SCALE_BOUNDS).exp()
 
 
 def make_tanh_gaussian_actor(
@@ -210,7 +195,6 @@ def make_tanh_gaussian_actor(
     action_spec: TensorSpec,
     *,
     hidden_sizes: Sequence[int] = HIDDEN_SIZES,
-    log_scale_bounds: tuple[float, float] = LOG_SCALE_BOUNDS,
     final_gain: float = 1.0,
 ) -> ProbabilisticTensorDictSequential:
     """A stochastic policy: a Gaussian, squashed by tanh into the bounds of the actions.
@@ -218,11 +202,7 @@ def make_tanh_gaussian_actor(
     Args:
         observation_size: length of an observation vector.
         action_spec: of one environment, bounded, ``[A]``.
-
-    Keyword Args:
-        hidden_sizes: units of each hidden layer.
-        log_scale_bounds: of the Gaussian before tanh. Default: (-5, 2); 2 is SAC's, its -20 is
-            never reached, and a scale of e^-5 acts like none.
+        hidden_sizes: units of each hidden layer. Default: (256, 256).
         final_gain: factor of the last layer's parameters at the start. Default: 1. With 0.01 the
             policy starts in the middle of the actions' range with a scale of 1, whatever it
             observes; where observations are large, as the forces in ``Humanoid-v5`` are, it would
@@ -230,8 +210,8 @@ def make_tanh_gaussian_actor(
             Reinforcement Learning?", Andrychowicz et al., 2021.
 
     Raises:
-        ValueError: if the actions are not vectors of bounded numbers, if the bounds of the scale
-            are not in order, or if ``final_gain`` is negative or not finite.
+        ValueError: if the actions are not vectors of bounded numbers, or if ``final_gain`` is
+            negative or not finite.
 
     Examples:
         >>> import torch
@@ -243,14 +223,11 @@ def make_tanh_gaussian_actor(
         (torch.Size([5, 1]), True)
     """
     spec = _bounded(action_spec)
-    low, high = log_scale_bounds
-    if not low < high:
-        raise ValueError(f"log_scale_bounds must be (low, high), got {log_scale_bounds}.")
     network: Any = DenseNetwork(
         ["observation"],
         ["loc", "scale"],
         [observation_size, *hidden_sizes, 2 * spec.shape[-1]],
-        partial(_loc_and_scale, log_scale_bounds=log_scale_bounds),
+        _loc_and_scale,
         final_gain=final_gain,
     )
     return ProbabilisticActor(
@@ -273,9 +250,7 @@ def make_deterministic_actor(
     Args:
         observation_size: length of an observation vector.
         action_spec: of one environment, bounded, ``[A]``.
-
-    Keyword Args:
-        hidden_sizes: units of each hidden layer.
+        hidden_sizes: units of each hidden layer. Default: (256, 256).
 
     Raises:
         ValueError: if the actions are not vectors of bounded numbers.
@@ -303,9 +278,7 @@ def make_qvalue_network(
     Args:
         observation_size: length of an observation vector.
         action_size: length A of an action vector.
-
-    Keyword Args:
-        hidden_sizes: units of each hidden layer.
+        hidden_sizes: units of each hidden layer. Default: (256, 256).
 
     Examples:
         >>> import torch
@@ -324,9 +297,7 @@ def make_value_network(
 
     Args:
         observation_size: length of an observation vector.
-
-    Keyword Args:
-        hidden_sizes: units of each hidden layer.
+        hidden_sizes: units of each hidden layer. Default: (256, 256).
 
     Examples:
         >>> import torch
