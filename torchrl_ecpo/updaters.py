@@ -237,15 +237,13 @@ class UpdaterSequence(TargetNetUpdater):
 
     It is a :class:`~torchrl.objectives.TargetNetUpdater` itself, so it goes wherever TorchRL takes
     one (a trainer's ``target_net_updater``, :class:`~torchrl.trainers.TargetNetUpdaterHook`), and
-    into another sequence. A delayed network without an updater may be updated by hand, so it is not
-    refused: a warning names it, and TorchRL's own warning follows at each call of the loss. There
-    is an example at the head of :mod:`torchrl_ecpo.updaters`.
+    into another sequence. There is an example at the head of :mod:`torchrl_ecpo.updaters`.
 
     Args:
         *updaters: updaters of one and the same loss, no two of which update the same network.
 
     Warns:
-        UserWarning: if a delayed network of the loss has no updater.
+        UserWarning: if a delayed network of the loss has no updater; it may be updated by hand.
 
     Raises:
         ValueError: if there are no updaters, if one of them is no TargetNetUpdater, if they belong

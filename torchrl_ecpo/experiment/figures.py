@@ -119,15 +119,7 @@ def plot_comparison(
 def draw_curve(
     panel: Axes, steps: np.ndarray, values: np.ndarray, *, color: str, label: str
 ) -> None:
-    """Draw the mean over runs and, of two or more, a band of its standard error.
-
-    Args:
-        panel: where to draw.
-        steps: ``[n]``.
-        values: ``[runs, n]``.
-        color: of line and band.
-        label: of the line, in the legend.
-    """
+    """Draw the mean over runs ``[runs, n]`` and, of two or more, a band of its standard error."""
     mean, runs = values.mean(axis=0), len(values)
     marker = "o" if len(steps) == 1 else None  # a line needs two points
     panel.plot(steps, mean, color=color, label=label, marker=marker)
