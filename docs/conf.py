@@ -44,6 +44,7 @@ nitpick_ignore_regex = [
     ),
     ("py:(class|exc)", "Axes|CheckpointError|EnvBase|NestedKey|Tensor|TensorDictBase"),
     ("py:class", r"torchrl_ecpo\..*\._.+"),  # what is private has no page
+    ("py:class", r"torchrl_ecpo\.modules\.histories\..+"),  # nor has the search for histories
     ("py:attr", "in_keys|loss_mask_key|out_keys"),  # of TorchRL's LossModule
 ]
 

@@ -160,7 +160,7 @@ class PeriodicCopy(_NetworkUpdater):
             Default: all delayed networks of the loss.
 
     Keyword Args:
-        interval: number N of calls of :meth:`step` from one copy to the next.
+        interval: number N of calls of `step` from one copy to the next.
 
     Attributes:
         counter: calls since the last copy, from 0 to N - 1; part of the state dict.
