@@ -76,7 +76,7 @@ class States:
     policy: Distribution
     """The policy being trained; carries the gradient."""
     reference: Distribution
-    """The policy that is lifted: a delayed copy, or the policy itself."""
+    """The policy that is lifted, a delayed copy or the policy itself."""
     make_lift: Callable[[TensorDictBase, Distribution], Lift]
     made: Lift | None = None
 
