@@ -18,7 +18,7 @@ from torch.testing import assert_close
 from torchrl.objectives import HardUpdate
 from trajectory_problems import MASK, gradients, make_actor, move, pad, sample, split
 
-from torchrl_ecpo import PolyakAverage, TemperatureScheduler, TrajectoryGroupLoss
+from torchrl_ecpo import ECACLoss, PolyakAverage, TemperatureScheduler, TrajectoryGroupLoss
 from torchrl_ecpo.functional import Surrogate
 from torchrl_ecpo.schedules import linear
 
@@ -282,6 +282,10 @@ def test_names_that_cannot_be_declared(names, message):
     bad = type("Bad", (Speaking,), names)
     with pytest.raises(ValueError, match=message):
         bad(make_actor())
+    networks = make_networks()
+    bad = type("Bad", (ECACLoss,), names)
+    with pytest.raises(ValueError, match=message):
+        bad(networks.actor, networks.qvalues)
 
 
 def test_a_member_names_its_temperatures_once():

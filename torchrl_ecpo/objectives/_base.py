@@ -249,6 +249,15 @@ class PolicyLoss(LossModule):
             conjunction = mask if conjunction is None else conjunction & mask
         return conjunction
 
+    def _check_names(self) -> None:
+        """Refuse declared names that would not be told from others; once all of them are known."""
+        for name in self.losses:
+            if not name.startswith("loss_"):
+                raise ValueError(f"The name of a loss begins with 'loss_', got {name!r}.")
+        repeated = [name for name in self._all_out_keys if self._all_out_keys.count(name) > 1]
+        if repeated:
+            raise ValueError(f"Names of every loss, or declared twice: {sorted(set(repeated))}.")
+
     def _check_declared(self, losses: Mapping[str, Tensor], metrics: Mapping[str, Tensor]) -> None:
         """Refuse other names than those in :attr:`out_keys`, which is known before the call."""
         for kind, returned in (("losses", losses), ("metrics", metrics)):

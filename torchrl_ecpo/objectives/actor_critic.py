@@ -215,6 +215,7 @@ class ActorCriticLoss(PolicyLoss):
         if action_keys:
             self.set_keys(action=action_keys[0])
         self._check_policy(actor_network)
+        self._check_names()
 
     def _add_critics(
         self,

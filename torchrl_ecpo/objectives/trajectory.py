@@ -177,12 +177,7 @@ class TrajectoryGroupLoss(PolicyLoss):
             delay_actor=delay_actor,
             reduction=reduction,
         )
-        for name in self.losses:
-            if not name.startswith("loss_"):
-                raise ValueError(f"The name of a loss begins with 'loss_', got {name!r}.")
-        repeated = [name for name in self._all_out_keys if self._all_out_keys.count(name) > 1]
-        if repeated:
-            raise ValueError(f"Names of every loss, or declared twice: {sorted(set(repeated))}.")
+        self._check_names()
 
     # ------------------------------------------------------------------------------- one method
 
