@@ -372,7 +372,8 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
             is written has more than one dimension, or the steps written hold padding.
         TypeError: if the storage does not hold a tensordict, or is not written round and round.
         KeyError: when data without `group_key` or `done_key` is written.
-        RuntimeError: at a draw, if there are fewer than `G` complete groups.
+        RuntimeError: at a draw, if there are fewer than `G` complete groups, or a storage that
+            is not full was written over.
 
     Examples:
         >>> import torch
@@ -491,6 +492,14 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
         steps, size = self._read(storage, slice(None)), storage.max_size
         starts, begins = _starts(steps), steps["done"].roll(1)
         for cursor, written, is_own in writers or [(0, 0, False)]:
+            if written and cursor < filled < size:
+                # A storage counts what is written over as new, up to memory that nobody wrote.
+                raise RuntimeError(
+                    f"The storage counts {filled} steps, but a buffer around it went on writing at "
+                    f"slot {cursor - written}, over the steps of another: the rest may never have "
+                    "been written. Restore the writer with the storage (load_state_dict, loads), "
+                    "or extend a new buffer with the old steps."
+                )
             if written <= size or filled < size:
                 starts[0] = begins[0] = True  # no trajectory goes round
             if written and cursor < filled:
