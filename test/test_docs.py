@@ -118,11 +118,13 @@ def test_examples_run(page, tmp_path, monkeypatch):
     for folder in ("docs", "sota-implementations"):
         (tmp_path / folder).symlink_to(ROOT / folder)
     monkeypatch.chdir(tmp_path)
+    blocks = python_blocks(page)
     for script, options in commands(page):
-        if "hydra.run.dir=" in options:  # the code of the page reads this run
+        directory = re.search(r"hydra\.run\.dir=(\S+)", options)
+        if directory and any(directory[1] in block for block in blocks):  # which read this run
             subprocess.run([sys.executable, script, *shlex.split(options)], check=True)
     namespace: dict[str, object] = {"__name__": "__main__"}
-    for number, block in enumerate(python_blocks(page), start=1):
+    for number, block in enumerate(blocks, start=1):
         exec(compile(block, f"{name(page)}, python block {number}", "exec"), namespace)
 
 
