@@ -33,6 +33,8 @@ def check_group_size(size: Any, name: str = "group_size") -> None:
 
 def check_mask(key: NestedKey, mask: Tensor, shape: torch.Size) -> Tensor:
     """A mask without its trailing 1, of the shape of the batch; refuse any other."""
+    if not isinstance(mask, Tensor):
+        raise TypeError(f"The mask {key!r} must be a boolean tensor, got {type(mask).__name__}.")
     if mask.shape == (*shape, 1):
         mask = mask.squeeze(-1)
     if mask.shape != shape:

@@ -33,19 +33,22 @@ keepdim                               whether the sample axis stays, with length
 ==================== ================ =====================================================
 
 Where an argument is what the table says, its function does not say it again. Temperatures are
-floats or 0-d tensors, in the unit of the score. Floats are checked (ValueError); tensors are taken
-as they are, so that nothing waits for a device. Finite input never gives NaN, as long as the
-temperatures are neither 0 nor infinite in the dtype of the scores (from 1e-37 to 1e38 in float32).
-Half precision is too narrow for sums over trajectories: give float32, as the losses do. A group in
-which all samples are masked has weights and a loss of 0, and no soft value.
+numbers or tensors (0-d, or one for each group), in the unit of the score. Numbers, types and shapes
+are checked (TypeError, ValueError), and shapes broadcast to one of theirs; the values of tensors
+are taken as they are, so that nothing waits for a device: NaN comes out as NaN. Finite input never
+gives NaN, as long as the temperatures are neither 0 nor infinite in the dtype of the scores (from
+1e-37 to 1e38 in float32). Half precision is too narrow for sums over trajectories: give float32, as
+the losses do. A group in which all samples are masked has weights and a loss of 0, and no soft
+value.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple, TypedDict
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -98,6 +101,54 @@ class _Where(TypedDict):
     mask: Tensor | None
 
 
+def _check_samples(
+    sample_dim: int | None = None, mask: Tensor | None = None, **values: Tensor | float | None
+) -> None:
+    """Refuse what is no tensor of real numbers, and shapes that none of the tensors has alone."""
+    tensors: dict[str, Tensor] = {}
+    for name, value in values.items():
+        if isinstance(value, Tensor) and (value.is_floating_point() or _is_score(name, value)):
+            tensors[name] = value
+        elif value is not None and not (name in ("tau", "tau_prime") and _is_number(value)):
+            raise TypeError(f"{name} must be a floating-point tensor, got {_kind(value)}.")
+    if mask is not None:
+        if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
+            raise TypeError(f"mask must be a boolean tensor, got {_kind(mask)}.")
+        tensors["mask"] = mask
+    first, *others = (value.shape for value in tensors.values())
+    shape = first if all(other == first for other in others) else _whole([first, *others])
+    if shape is None:
+        listed = ", ".join(f"{name} {tuple(value.shape)}" for name, value in tensors.items())
+        raise ValueError(f"The shapes do not fit each other: {listed}.")
+    if sample_dim is not None and sample_dim not in range(-len(shape), len(shape)):
+        raise ValueError(
+            f"sample_dim must be an axis of {', '.join(tensors)}, which have the shape "
+            f"{tuple(shape)}, got {sample_dim!r}."
+        )
+
+
+def _whole(shapes: Sequence[torch.Size]) -> torch.Size | None:
+    """The one of the shapes to which the others broadcast, if there is one."""
+    try:
+        whole = torch.broadcast_shapes(*shapes)
+    except RuntimeError:
+        return None
+    return whole if whole in shapes else None
+
+
+def _is_score(name: str, value: Tensor) -> bool:
+    """Rewards may be integers."""
+    return name == "score" and not value.is_complex() and value.dtype != torch.bool
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float, np.number)) and not isinstance(value, (bool, complex))
+
+
+def _kind(value: object) -> str:
+    return str(value.dtype) if isinstance(value, Tensor) else type(value).__name__
+
+
 # --------------------------------------------------------------------------------------- the lift
 
 
@@ -116,8 +167,8 @@ def check_temperatures(*, allow_zero: bool = False, **temperatures: float | Tens
     """
     floats = {name: t for name, t in temperatures.items() if not isinstance(t, Tensor)}
     for name, value in floats.items():
-        if not 0 <= value < math.inf:
-            raise ValueError(f"{name} must be a finite number >= 0, got {value}.")
+        if not (_is_number(value) and 0 <= value < math.inf):
+            raise ValueError(f"{name} must be a finite number >= 0, got {value!r}.")
     none_is_positive = len(floats) == len(temperatures) and not any(floats.values())
     if temperatures and none_is_positive and not allow_zero:
         raise ValueError(
@@ -152,6 +203,7 @@ def lifted_log_weights(
         tensor([2.0000, 0.3333])
     """
     check_temperatures(tau=tau, tau_prime=tau_prime)
+    _check_samples(score=score, reference_log_prob=reference_log_prob, tau=tau, tau_prime=tau_prime)
     return _representable((score - tau_prime * reference_log_prob) / (tau + tau_prime))
 
 
@@ -171,6 +223,7 @@ def self_normalised_weights(
         >>> self_normalised_weights(torch.zeros(3), mask=torch.tensor([True, True, False]))
         tensor([0.5000, 0.5000, 0.0000])
     """
+    _check_samples(sample_dim, mask, log_weights=log_weights)
     if mask is None:
         return log_weights.softmax(sample_dim)
     weights = log_weights.where(mask, _lowest(log_weights)).softmax(sample_dim).where(mask, 0.0)
@@ -192,6 +245,7 @@ def effective_sample_size(weights: Tensor, *, sample_dim: int = -1) -> Tensor:
         >>> effective_sample_size(torch.tensor([0.75, 0.25]))
         tensor(1.6000)
     """
+    _check_samples(sample_dim, weights=weights)
     # Scaled by the largest weight, so that no square under- or overflows.
     scaled = weights / weights.amax(sample_dim, keepdim=True).clamp_min(_tiny(weights))
     squares = scaled.square().sum(sample_dim)
@@ -216,6 +270,7 @@ def lift_divergence_estimate(
         >>> lift_divergence_estimate(torch.tensor([[0.5, 0.5], [1.0, 0.0]])) / math.log(2)
         tensor([0., 1.])
     """
+    _check_samples(sample_dim, mask, weights=weights)
     # 0 log 0 = 0
     log_ratio = weights.clamp_min(_tiny(weights)).log() - _log_uniform(weights, sample_dim, mask)
     return weighted_sum(weights, log_ratio, sample_dim=sample_dim, mask=mask).clamp_min(0.0)
@@ -241,6 +296,7 @@ def temperature_dual(log_temperature: Tensor, excess: Tensor) -> Tensor:
         >>> log_tau.grad  # gradient descent raises log tau
         tensor(-0.3000)
     """
+    _check_samples(log_temperature=log_temperature, excess=excess)
     return -log_temperature * excess.detach()
 
 
@@ -278,6 +334,13 @@ def mean_seeking_projection(
         >>> loss.backward(); loss.detach(), log_prob.grad
         (tensor(1.7500), tensor([-0.7500, -0.2500]))
     """
+    _check_samples(
+        sample_dim,
+        mask,
+        log_prob=log_prob,
+        log_weights=log_weights,
+        control_log_prob=control_log_prob,
+    )
     where: _Where = {"sample_dim": sample_dim, "mask": mask}
     weights = self_normalised_weights(log_weights.detach(), **where)
     coefficients = weights
@@ -340,7 +403,21 @@ def centred_gaussian_projection(
         >>> loss.backward(); loc.grad, scale.grad
         (tensor([-2.]), tensor([-1.]))
     """
+    _check_samples(sample_dim, log_weights=log_weights)
+    _check_samples(loc=loc)
     dim = sample_dim % log_weights.ndim
+    each, one = log_weights.shape, log_weights.select(dim, 0).shape
+    of_each = {"loc": (loc, one), "scale": (scale, one), "samples": (samples, each)}
+    for name, (value, shape) in of_each.items():
+        _check_samples(None, None, **{name: value})
+        if value.shape[:-1] != shape or value.shape[-1:] != loc.shape[-1:]:
+            raise ValueError(
+                f"{name} must have the shape {tuple(shape)} and an axis of A more, as "
+                f"log_weights have {tuple(each)} and loc {tuple(loc.shape)}, got "
+                f"{tuple(value.shape)}."
+            )
+    if mask is not None and getattr(mask, "shape", None) != each:
+        raise ValueError(f"mask must have the shape {tuple(each)} of log_weights.")
     weights = self_normalised_weights(log_weights.detach(), sample_dim=dim, mask=mask)
     samples = samples.detach()
     if mask is not None:
@@ -401,6 +478,14 @@ def mode_seeking_projection(
         >>> loss.backward(); v, log_prob.grad
         (tensor([0.5000, 0.5000]), tensor([-0.2500,  0.2500]))
     """
+    _check_samples(
+        sample_dim,
+        mask,
+        log_prob=log_prob,
+        reference_log_prob=reference_log_prob,
+        log_weights=log_weights,
+        behaviour_log_prob=behaviour_log_prob,
+    )
     where: _Where = {"sample_dim": sample_dim, "mask": mask}
     current, reference_log_prob = log_prob.detach(), reference_log_prob.detach()
     behaviour = reference_log_prob if behaviour_log_prob is None else behaviour_log_prob.detach()
@@ -439,6 +524,7 @@ def urex_surrogate(
         (tensor([0.7500, 0.2500]), tensor([-1.,  1.]))
     """
     check_temperatures(tau=tau)
+    _check_samples(sample_dim, mask, log_prob=log_prob, score=score, tau=tau)
     current, score = log_prob.detach(), score.detach()
     log_weights = lifted_log_weights(score, current, tau=0.0, tau_prime=tau)
     where: _Where = {"sample_dim": sample_dim, "mask": mask}
@@ -475,6 +561,7 @@ def ment_surrogate(
         tensor([-0.2500,  0.2500])
     """
     check_temperatures(tau=tau, allow_zero=True)
+    _check_samples(sample_dim, mask, log_prob=log_prob, score=score, tau=tau)
     where: _Where = {"sample_dim": sample_dim, "mask": mask}
     signal = score - tau * log_prob.detach()
     loss = score_function_loss(log_prob, centred(signal, **where), **where)
@@ -511,6 +598,8 @@ def soft_value(
         tensor(0.2500)
     """
     check_temperatures(tau=tau, tau_prime=tau_prime)
+    values = {"score": score, "reference_log_prob": reference_log_prob}
+    _check_samples(sample_dim, mask, **values, tau=tau, tau_prime=tau_prime)
     temperature = tau + tau_prime
     logits = _representable((score + tau * reference_log_prob) / temperature)
     return temperature * _masked_logsumexp(logits, sample_dim, mask)
@@ -541,6 +630,7 @@ def soft_value_estimate(
         >>> soft_value_estimate(torch.ones(1), torch.tensor([-2.0]), tau=0.5, tau_prime=0.25)
         tensor(1.5000)
     """
+    _check_samples(sample_dim, mask, score=score, reference_log_prob=reference_log_prob)
     log_weights = lifted_log_weights(score, reference_log_prob, tau=tau, tau_prime=tau_prime)
     return (tau + tau_prime) * log_mean_exp(log_weights, sample_dim=sample_dim, mask=mask)
 
@@ -618,10 +708,9 @@ def theorem1_temperatures(horizon: float, num_trajectories: int) -> tuple[float,
         >>> round(tau, 4), round(tau_prime, 4)
         (4.594, 0.0659)
     """
-    if not 1 <= horizon < math.inf:
-        raise ValueError(f"horizon must be at least 1 and finite, got {horizon}.")
-    if not 2 <= num_trajectories < math.inf:
-        raise ValueError(f"num_trajectories must be at least 2 and finite, got {num_trajectories}.")
+    for name, value, least in (("horizon", horizon, 1), ("num_trajectories", num_trajectories, 2)):
+        if not (_is_number(value) and least <= value < math.inf):
+            raise ValueError(f"{name} must be at least {least} and finite, got {value!r}.")
     log_n = math.log(num_trajectories)
     total = math.sqrt(horizon / (2 * log_n))
     tau_prime = min(1 / math.sqrt(horizon * log_n), total)
@@ -641,6 +730,7 @@ def uniform_weights(like: Tensor, *, sample_dim: int = -1, mask: Tensor | None =
         >>> uniform_weights(torch.rand(3), mask=torch.tensor([True, True, False]))
         tensor([0.5000, 0.5000, 0.0000])
     """
+    _check_samples(sample_dim, mask, like=like)
     if mask is None:
         return torch.full_like(like, 1 / like.shape[sample_dim])
     return self_normalised_weights(torch.zeros_like(like), sample_dim=sample_dim, mask=mask)
@@ -663,6 +753,7 @@ def weighted_sum(
         >>> weighted_sum(weights, values, mask=torch.tensor([True, True, False]))
         tensor(2.)
     """
+    _check_samples(sample_dim, mask, weights=weights, values=values)
     if mask is not None:
         weights, values = weights.where(mask, 0.0), values.where(mask, 0.0)
     # The constant is clipped, not the product, so that an overflow leaves a gradient.
@@ -680,6 +771,7 @@ def masked_mean(
         >>> masked_mean(torch.tensor([1.0, 3.0, math.nan]), mask=torch.tensor([True, True, False]))
         tensor(2.)
     """
+    _check_samples(sample_dim, mask, values=values)
     where: _Where = {"sample_dim": sample_dim, "mask": mask}
     return weighted_sum(uniform_weights(values, **where), values, **where, keepdim=keepdim)
 
@@ -693,6 +785,7 @@ def centred(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None) 
         >>> centred(torch.tensor([1.0, 2.0, 9.0]), mask=torch.tensor([True, True, False]))
         tensor([-0.5000,  0.5000,  0.0000])
     """
+    _check_samples(sample_dim, mask, score=score)
     score = _representable(score.detach())
     distance = score - masked_mean(score, sample_dim=sample_dim, mask=mask, keepdim=True)
     return distance if mask is None else distance.where(mask, 0.0)
@@ -741,6 +834,7 @@ def score_function_loss(
         >>> score_function_loss(log_prob, torch.tensor([0.5, -0.5])).backward(); log_prob.grad
         tensor([-0.2500,  0.2500])
     """
+    _check_samples(sample_dim, mask, log_prob=log_prob, advantage=advantage)
     uniform = uniform_weights(log_prob, sample_dim=sample_dim, mask=mask)
     return -weighted_sum(uniform * advantage.detach(), log_prob, sample_dim=sample_dim, mask=mask)
 
@@ -760,6 +854,7 @@ def log_mean_exp(values: Tensor, *, sample_dim: int = -1, mask: Tensor | None = 
         >>> log_mean_exp(torch.tensor([1.0, 3.0]).log()).exp()
         tensor(2.)
     """
+    _check_samples(sample_dim, mask, values=values)
     return _masked_logsumexp(values + _log_uniform(values, sample_dim, mask), sample_dim, mask)
 
 
@@ -776,6 +871,7 @@ def _masked_logsumexp(values: Tensor, dim: int, mask: Tensor | None) -> Tensor:
 
 def _representable(values: Tensor) -> Tensor:
     """Clip overflow: a softmax of the result is a maximum, and differences stay finite."""
+    values = values if values.is_floating_point() else values.to(torch.get_default_dtype())
     largest = torch.finfo(values.dtype).max / 4
     return values.clamp(-largest, largest)
 

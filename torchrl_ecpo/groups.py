@@ -149,6 +149,9 @@ def unpack_groups(data: TensorDictBase, *, mask_key: NestedKey = MASK_KEY) -> Te
         data: trajectories `[..., T]`; without `mask_key`, all of their steps are real.
         mask_key: the mask of the real steps, bool `[..., T]`. It is left out of the result.
 
+    Raises:
+        ValueError: if the mask is not boolean, or of another shape.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -160,7 +163,7 @@ def unpack_groups(data: TensorDictBase, *, mask_key: NestedKey = MASK_KEY) -> Te
     mask = data.get(mask_key, None)
     if mask is None:
         return data.reshape(-1)
-    real = mask.reshape(-1).nonzero().squeeze(-1)
+    real = check_mask(mask_key, mask, data.shape).reshape(-1).nonzero().squeeze(-1)
     # A copy of the structure, from which empty entries go: what is nested in it is the caller's.
     return data.exclude(mask_key).copy().filter_empty_().reshape(-1)[real]
 
@@ -182,13 +185,21 @@ def _read_steps(
         if value is None:
             continue
         is_id = name in ("group", "trajectory")
+        kind = "integers" if is_id else "flags, boolean or 0 and 1"
+        if not isinstance(value, Tensor):
+            raise TypeError(f"The entry {key!r} must hold {kind}, got {type(value).__name__}.")
         if value.shape not in (data.shape, (*data.shape, 1)):
             raise ValueError(
                 f"The entry {key!r} must have the shape {tuple(data.shape)} of the steps, with or "
                 f"without a trailing 1, got {tuple(value.shape)}."
             )
-        if is_id and (value.is_floating_point() or value.dtype == torch.bool):
-            raise ValueError(f"The entry {key!r} must hold integers, got {value.dtype}.")
+        dtype = value.dtype
+        if is_id:
+            is_wrong = dtype.is_floating_point or dtype.is_complex or dtype == torch.bool
+        else:
+            is_wrong = dtype.is_complex or ((value != 0) & (value != 1)).any()
+        if is_wrong:
+            raise ValueError(f"The entry {key!r} must hold {kind}, got {dtype}.")
         steps[name] = value.reshape(data.shape).to(torch.int64 if is_id else torch.bool)
     return steps
 
