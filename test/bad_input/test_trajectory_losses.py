@@ -1,0 +1,47 @@
+"""Bad batches and options of the losses over groups of trajectories."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from faults import Subject, check, tensordict_of
+from trajectory_problems import CASES, MASK, make_actor, sample
+
+OPTIONS = ("tau", "tau_prime", "delay_actor", "reduction", "control_variate")
+SHAPE = (2, 3, 4)
+
+
+def good(kind, *, dtype=torch.float64):
+    batch = sample(make_actor(kind, dtype=dtype), *SHAPE)
+    keys = ("observation", "action", "action_log_prob", ("next", "reward"))
+    mask = torch.arange(4) < torch.tensor([[4, 1, 3], [2, 4, 3]]).unsqueeze(-1)
+    return {key: batch[key] for key in keys} | {MASK: mask, "group": torch.tensor([[0], [1]]).unsqueeze(-1).expand(SHAPE)}
+
+
+def call(case, kind):
+    def run(entries):
+        options = {name: entries[name] for name in OPTIONS if name in entries}
+        actor = make_actor(kind)
+        loss_module = case.loss(actor, **options)
+        batch = {key: value for key, value in entries.items() if key not in OPTIONS}
+        losses = loss_module(tensordict_of(batch, SHAPE))
+        losses["loss_actor"].sum().backward()
+        gradients = [parameter.grad for parameter in actor.parameters()]
+        return {name: value.detach() for name, value in losses.items()}, gradients
+
+    return run
+
+
+def subject(name, kind):
+    case = CASES[name]
+    options = {**case.temperatures, "delay_actor": False, "reduction": "none"}
+    if name == "ecpo":
+        options["control_variate"] = False
+    optional = (MASK, *options)
+    return Subject(call(case, kind), good(kind) | options, optional=optional)
+
+
+@pytest.mark.parametrize("kind", ["categorical", "normal"])
+@pytest.mark.parametrize("name", CASES)
+def test_trajectory_losses(name, kind):
+    check(f"`{CASES[name].loss.__name__}`, {kind} policy", subject(name, kind))
