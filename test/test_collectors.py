@@ -12,7 +12,7 @@ import ray
 import torch
 from tensordict import TensorDict
 from tensordict import assert_close as assert_td_close
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
 from torch import nn
 from torch.testing import assert_close
 from torchrl.data import (
@@ -35,6 +35,7 @@ from torchrl.modules import (
     LSTMModule,
     ProbabilisticActor,
     RandomPolicy,
+    TanhNormal,
     get_env_transforms_from_module,
 )
 from torchrl.trainers import Trainer, UpdateWeights
@@ -98,6 +99,18 @@ def linear_policy(weight=0.0):
     with torch.no_grad():
         module.weight.copy_(torch.tensor([[0.0, weight]]))
     return TensorDictModule(module, ["observation"], ["action"])
+
+
+class Moded(nn.Linear):
+    """Says beside its output whether it is in training mode."""
+
+    def forward(self, x):
+        output = super().forward(x)
+        return output, torch.full_like(output, self.training)
+
+
+def moded_policy():
+    return TensorDictModule(Moded(2, 1, bias=False), ["observation"], ["action", "training"])
 
 
 def recurrent_policy():
@@ -331,6 +344,39 @@ def test_a_batch_is_sampled_from_the_reference():
     collector.shutdown()
 
 
+@pytest.mark.parametrize("by_factory", [False, True])
+def test_the_training_mode_is_the_policys(by_factory):
+    """At each batch, of each of its modules; a factory's policy follows whose weights it has."""
+    policy = moded_policy()
+    made = {"policy_factory": moded_policy} if by_factory else {"policy": policy}
+    collector = TrajectoryGroupCollector(Countdown(), num_groups=2, group_size=3, **made)
+    for training in (True, False, True):
+        policy.module.train(training)
+        if by_factory:
+            collector.update_policy_weights_(policy)
+        batch = collector.rollout()
+        assert (batch["training"][batch["collector", "mask"]] == training).all()
+    collector.shutdown()
+
+
+def test_latents_of_squashed_actions_are_recorded():
+    """What a policy has drawn is known again by the loss, where tanh is long saturated."""
+    network = nn.Sequential(nn.Linear(2, 2), NormalParamExtractor())
+    network[0].bias.data = torch.tensor([6.0, 4.0])
+    policy = ProbabilisticActor(
+        TensorDictModule(network, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+    )
+    batch = collect(Countdown(), policy, exclude_keys=["loc", "scale"])
+    mask = batch["collector", "mask"]
+    assert_close(batch["action_latent"].tanh()[mask], batch["action"][mask], rtol=0, atol=2e-6)
+    assert ECPOLoss(policy)(batch)["kl_reference_policy"].item() == pytest.approx(0, abs=1e-4)
+    step = policy(batch.select("observation"))
+    assert "action_latent" not in step  # the collector's copy records, not the policy
+
+
 @pytest.mark.parametrize("update_at", [1, 4, 9])
 def test_an_update_within_a_batch_counts_from_the_next_one(update_at):
     steps = 0
@@ -540,7 +586,8 @@ for pickle in (cloudpickle, ray.cloudpickle):
 
 @pytest.mark.parametrize("sync", [True, False])
 def test_worker_processes(sync):
-    policy = linear_policy()
+    policy = moded_policy()
+    policy.module.weight.data.zero_()
     collector = TrajectoryGroupCollector(
         Countdown, policy, num_groups=4 if sync else 2, group_size=3, sync=sync,
         num_collectors=2 if sync else 1,
@@ -548,7 +595,7 @@ def test_worker_processes(sync):
     )  # fmt: skip
     assert isinstance(collector, TrajectoryGroupCollector)
     workers = sorted(multiprocessing.active_children(), key=lambda process: process.pid)
-    frames, groups, ids, weights = 0, [], [], []
+    frames, groups, ids, weights, modes = 0, [], [], [], []
     with shut_down(collector):
         collector.set_seed(0)
         for i, batch in enumerate(collector, start=1):
@@ -560,6 +607,8 @@ def test_worker_processes(sync):
             acted = batch["action"][batch["collector", "mask"]]
             assert (acted == acted[0]).all()  # one policy for the whole batch
             weights.append(float(acted[0]))
+            modes.append(bool(batch["training"][0, 0, 0]))
+            policy.train(i % 2 == 0)
             with torch.no_grad():
                 policy.module.weight[0, 1] = i
             collector.update_policy_weights_()
@@ -574,6 +623,7 @@ def test_worker_processes(sync):
     assert len(set(ids)) == len(ids)
     # A worker that does not wait has begun the next batch when it hands over one.
     assert weights == [max(i - (not sync), 0) for i in range(len(weights))]
+    assert modes == [weight % 2 == 0 for weight in weights]
 
 
 def test_an_error_in_a_worker_process_is_raised_here():

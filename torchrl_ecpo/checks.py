@@ -49,6 +49,18 @@ def check_mask(key: NestedKey, mask: Tensor, shape: torch.Size) -> Tensor:
     return mask
 
 
+def check_real(key: NestedKey, values: Tensor) -> None:
+    """Refuse complex numbers, the imaginary part of which would be dropped."""
+    if values.is_complex():
+        raise ValueError(f"The entry {key!r} must hold real numbers, got {values.dtype}.")
+
+
+def check_integers(key: NestedKey, values: Tensor) -> None:
+    """Refuse other numbers, which would be cut to integers."""
+    if values.is_floating_point() or values.is_complex():
+        raise ValueError(f"The entry {key!r} must hold integers, got {values.dtype}.")
+
+
 def check_padding(keys: Sequence[NestedKey], mask: Tensor) -> None:
     """Refuse holes ``[..., T]``: a policy with memory would read other histories than it acted on.
 

@@ -578,6 +578,18 @@ def test_input_is_untouched_but_for_the_priority(case):
     assert (priority > 0).all()
 
 
+@pytest.mark.parametrize("lock", ["lock_", "memmap_", "share_memory_"])
+def test_locked_batches(lock):
+    """Where nothing can be added, the priority goes into the entry that is there."""
+    batch = _batch()
+    expected = call(CASE.build(), batch)
+    priority = batch.pop("td_error")
+    assert_close(call(CASE.build(), getattr(batch.clone(), lock)()), expected)
+    locked = getattr(batch.clone().set("td_error", torch.zeros_like(priority)), lock)()
+    assert_close(call(CASE.build(), locked), expected)
+    assert_close(locked["td_error"], priority)
+
+
 # ----------------------------------------------------------------------------------------- copies
 
 
@@ -645,6 +657,24 @@ def test_recurrent_q_network():
     assert_close(of_samples, chosen.expand(4, 3, 5))
 
 
+def test_samples_are_more_rows():
+    """A Q network that knows what it reads, [rows, steps, n], is given no other axis."""
+    shapes = []
+
+    def over_time(observation, action):
+        shapes.append(observation.shape)
+        return convolution(torch.cat([observation, action], -1).mT).mT
+
+    convolution = nn.Conv1d(OBSERVATION + ACTION, 1, 1).double()
+    networks = make_networks()
+    network = TensorDictModule(over_time, ["observation", "action"], ["state_action_value"])
+    network.convolution = convolution  # its parameters are the network's
+    networks.qvalues = network  # type: ignore
+    loss = CASE.build(networks, delay_qvalue=False, num_action_samples=4)
+    call(loss, _batch(CASE, 3, 5))
+    assert {*shapes} == {(3, 5, OBSERVATION), (4 * 3, 5, OBSERVATION)}
+
+
 # ----------------------------------------------------------------------------- masks of actions
 
 
@@ -689,6 +719,23 @@ def test_forbidden_actions_have_no_part(name, distribution, tau):
         if "actor" in key:
             assert_close(gradient[key][:-1], value)
             assert (gradient[key][-1] == 0).all()
+
+
+def test_padding_forbids_no_action():
+    """In a transition that is not real all actions may be taken, or the policy would be NaN."""
+    case, networks = CASES["discrete_ecac"], make_networks("categorical")
+    networks.actor = ProbabilisticActor(
+        networks.actor[0],
+        {"logits": "logits", "mask": "action_mask"},
+        distribution_class=MaskedCategorical,
+    )
+    loss, batch = case.build(networks, delay_actor=False), _batch(case)
+    for where in (batch, batch["next"]):
+        where["action_mask"] = torch.ones(6, CHOICES, dtype=torch.bool)
+    batch[MASK] = torch.arange(6) < 5
+    outputs = call(loss, batch)
+    assert outputs["entropy"].isfinite()
+    assert all(g.isfinite().all() for g in gradients(loss, total(outputs)).values())
 
 
 # ------------------------------------------------------------------------------ masks and weights
@@ -1098,6 +1145,7 @@ def test_policies_of_another_kind(case):
     ("key", "entry", "message"),
     [
         (("next", "reward"), torch.ones(6), r"have the shape \[\*B, 1\], got \(6,\)"),
+        (("next", "reward"), torch.ones(6, 1).cfloat(), "hold real numbers, got torch.complex64"),
         (("next", "done"), torch.zeros(6).bool(), r"have the shape \(6, 1\) of the reward"),
         (("next", "terminated"), torch.zeros(6).bool(), r"have the shape \(6, 1\) of the reward"),
         (MASK, torch.ones(5).bool(), r"have the shape \(6,\).*got \(5,\)"),

@@ -474,7 +474,8 @@ def test_batches_of_any_kind():
         assert shallow.batch_dims == dims
     for dim in (0, 1):
         assert_close(loss(lazy_stack(list(batch.unbind(dim)), dim)), expected)
-    assert_close(loss(batch.clone().lock_()), expected)
+    for lock in ("lock_", "memmap_", "share_memory_"):
+        assert_close(loss(getattr(batch.clone(), lock)()), expected)
 
 
 def test_lists_of_keys():
@@ -607,6 +608,42 @@ BAD_BATCHES = {
         *(_poke("action_log_prob", -torch.inf), ValueError),
         NOT_FINITE.format("'action_log_prob'"),
     ),
+    "complex reward": (
+        *(_set(REWARD, lambda x: x.cfloat()), ValueError),
+        r"\('next', 'reward'\) must hold real numbers, got torch.complex64",
+    ),
+    "rows of two groups": (
+        *(_set("group", torch.arange(3).expand(2, 3).unsqueeze(-1).expand(2, 3, 4)), ValueError),
+        r"4 rows of the batch.* are of another group \('group'\) than the first",
+    ),
+    "one-step rows of two groups": (
+        lambda b: b[..., -1:].set("group", torch.arange(3).expand(2, 3).unsqueeze(-1)),
+        *(ValueError, r"4 rows of the batch.* are of another group"),
+    ),
+    "rows that go on after an end": (
+        *(_poke(("next", "done"), True), ValueError),
+        r"1 rows of the batch.* go on after an end \(\('next', 'done'\)\)",
+    ),
+    "observation of another length": (
+        *(_set("observation", lambda x: x[..., :2]), ValueError),
+        r"cannot be evaluated on the entries 'observation' torch.float64 \(6, 4, 2\), 'action'",
+    ),
+    "action out of range": (
+        *(_poke("action", 9), ValueError),
+        r"actor cannot be evaluated on the entries .*'action' torch.int64 \(6, 4\).*out of bounds",
+    ),
+    "action that is no index": (
+        *(_set("action", lambda x: x + 0.5), ValueError),
+        "'action' must hold integers, got torch.float32",
+    ),
+    "complex log-prob": (
+        *(_set("action_log_prob", lambda x: x.cfloat()), ValueError),
+        "'action_log_prob' must hold real numbers",
+    ),
+    "NaN observation": (
+        *(_poke("observation", torch.nan), ValueError),
+        r"of the entries \['action'\], given \['observation'\], under.* is NaN or infinite in 1",
+    ),
     "log-prob with a trailing dimension": (
         *(_set("action_log_prob", lambda x: x.unsqueeze(-1)), ValueError),
         r"'action_log_prob'.*\(2, 3, 4\).*got \(2, 3, 4, 1\).*trailing dimension",
@@ -622,6 +659,26 @@ def test_bad_batch(name):
     batch = spoil(sample(actor, 2, 3, 4))
     with pytest.raises(error, match=message):
         ECPO.build(actor)(batch)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_one_step_problems_without_a_time_axis(masked):
+    """[G, K] of steps that are ends all: groups of K, not one group of G."""
+    loss, _, batch = problem(ECPO, padded=False)
+    batch = batch[..., 0].clone()
+    batch["next", "done"] = torch.ones(2, 3, 1, dtype=torch.bool)
+    if masked:
+        batch[MASK] = torch.tensor([[True, True, True], [True, True, False]])
+    loss.reduction = "none"
+    out = loss(batch)
+    assert out.shape == (2,)
+    assert_close(out, loss(batch.unsqueeze(-1)))
+
+
+def test_no_value_estimator():
+    """Returns are sums, and say so where somebody asks for another gamma."""
+    with pytest.raises(NotImplementedError, match=r"undiscounted sum of \('next', 'reward'\)"):
+        ECPO.build(make_actor()).make_value_estimator(gamma=0.9)
 
 
 def test_actor_with_a_log_prob_of_trailing_dimension():
@@ -689,6 +746,22 @@ def test_bad_temperature(name, temperature, value, message):
     assert getattr(loss, temperature).item() == case.temperatures[temperature]
     setattr(loss, temperature, torch.tensor(0.25))
     assert dict(loss.named_buffers())[temperature].item() == 0.25
+
+
+@pytest.mark.parametrize(("name", "temperature"), TEMPERATURES)
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
+def test_bad_temperature_written_or_loaded(name, temperature, value):
+    """In place it is seen at the next call; of a state dict nothing is loaded."""
+    loss, _, batch = problem(CASES[name])
+    state = {**loss.state_dict(), temperature: torch.tensor(value)}
+    message = rf"{temperature} must be a finite number >= 0, got"
+    before = getattr(loss, temperature).item()
+    with pytest.raises(ValueError, match=message):
+        torch.nn.ModuleList([loss]).load_state_dict({f"0.{k}": v for k, v in state.items()})
+    assert getattr(loss, temperature).item() == before
+    getattr(loss, temperature).fill_(value)
+    with pytest.raises(ValueError, match=message):
+        loss(batch)
 
 
 @losses

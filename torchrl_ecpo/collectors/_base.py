@@ -39,7 +39,8 @@ class PlayerCollector(BaseCollector):
     ) -> None:
         """Count from zero; who extends this makes `_workers`."""
         super().__init__()
-        self._learner = policy
+        self._learner = self._moded = policy
+        self._modes = _modes_of(policy)
         self.total_frames: float = float("inf") if total_frames < 0 else total_frames
         self.postproc, self.replay_buffer = postproc, replay_buffer
         self.closed, self._frames, self._iter = False, 0, -1
@@ -47,6 +48,14 @@ class PlayerCollector(BaseCollector):
     def rollout(self) -> Any:
         """Collect a batch, which is not counted nor written anywhere."""
         raise NotImplementedError
+
+    def _play(self) -> list[tuple[int, Any]]:
+        """What the players collect, in the training mode that the policy has now."""
+        modes = _modes_of(self._moded)
+        if modes != self._modes:
+            self._modes = modes
+            self._workers.tell("set_training", modes)
+        return self._workers.play()
 
     def iterator(self) -> Iterator[Any]:
         """Yield batches, or None after each that is written to the replay buffer.
@@ -77,6 +86,7 @@ class PlayerCollector(BaseCollector):
         """Copy the weights of the policy, or those given, to the reference that acts.
 
         They count from the next batch. With workers that do not wait, that is the next one begun.
+        The training mode of the policy, ``policy.eval()``, follows by itself.
 
         Args:
             policy_or_weights: the weights, or a module that has them. Default: the policy.
@@ -88,6 +98,7 @@ class PlayerCollector(BaseCollector):
             policy_or_weights = weights_dict["policy"]
         source = self._learner if policy_or_weights is None else policy_or_weights
         if isinstance(source, nn.Module):
+            self._moded = source
             own: Any = TensorDict.from_module(source)
             source = own.data
         elif source is None and self._has_factory:
@@ -122,3 +133,9 @@ class PlayerCollector(BaseCollector):
         if not self.closed:
             self.closed = True
             self._workers.stop(timeout)
+
+
+def _modes_of(policy: Any) -> dict[str, bool]:
+    """Whether each module of a policy is in training mode."""
+    is_module = isinstance(policy, nn.Module)
+    return {name: m.training for name, m in policy.named_modules()} if is_module else {}

@@ -52,7 +52,9 @@ class TrajectoryGroupCollector(PlayerCollector):
     - is on-policy by the letter of Algorithm 1: all trajectories of a batch come from the same
       weights. The collector samples from a copy of the policy, the reference, which changes only
       when :meth:`update_policy_weights_` is called, on every backend, and with the next batch: one
-      that is being played keeps its weights;
+      that is being played keeps its weights. Its training mode is that of the policy at each batch;
+    - records the latents of squashed actions, ``"action_latent"``, which a loss evaluates
+      (:func:`~torchrl_ecpo.modules.record_latents`);
     - spends nothing on trajectories that have ended: the policy sees the rows of the others, and
       the environment gets ``"_step"``. Nothing runs across batches, so nothing is thrown away;
     - sees to what a recurrent policy needs: the environment may lack `InitTracker` and primers.
@@ -170,7 +172,7 @@ class TrajectoryGroupCollector(PlayerCollector):
 
     def rollout(self) -> TensorDictBase:
         """Collect a batch of groups `[G, K, T]`, which is not counted nor written anywhere."""
-        played = self._workers.play()
+        played = self._play()
         for worker, batch in played:  # each counts its trajectories for itself
             ids = batch[TRAJECTORY_KEY] * len(self._workers) + worker
             batch.set(TRAJECTORY_KEY, ids * batch[MASK_KEY])

@@ -27,7 +27,9 @@ from torchrl.modules import (
     set_exploration_modules_spec_from_env,
 )
 
+from torchrl_ecpo.collectors.workers import set_training
 from torchrl_ecpo.groups import GROUP_KEY, MASK_KEY, TRAJECTORY_KEY
+from torchrl_ecpo.modules import record_latents
 
 
 class GroupPlayer:
@@ -74,6 +76,7 @@ class GroupPlayer:
             self.policy.set_action_spec_from_env(env)
         elif isinstance(self.policy, nn.Module):
             self.policy.to(policy_device)
+            record_latents(self.policy)
             set_exploration_modules_spec_from_env(self.policy, env)
         # What the policy needs acts at resets alone. In a step it would cost as much as all else
         # around the rules of a fast environment.
@@ -115,6 +118,8 @@ class GroupPlayer:
                 "with TorchRL's ExcludeTransform, or sample by a loop of your own: pack_groups "
                 "keeps them."
             )
+
+    set_training = set_training
 
     def set_weights(self, weights: TensorDictBase) -> None:
         """Copy weights to the policy, between two batches."""

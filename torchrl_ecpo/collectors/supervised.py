@@ -12,7 +12,7 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 
 from torchrl_ecpo.collectors._base import PlayerCollector
-from torchrl_ecpo.collectors.workers import Workers
+from torchrl_ecpo.collectors.workers import Workers, set_training
 
 __all__ = ["SupervisedAsyncCollector", "SupervisedSyncCollector", "shut_down"]
 
@@ -22,6 +22,7 @@ class _FramePlayer(Collector):
 
     play = Collector.next
     set_weights = Collector.update_policy_weights_
+    set_training = set_training
     close = Collector.shutdown
 
 
@@ -71,7 +72,7 @@ class SupervisedSyncCollector(PlayerCollector):
 
     def rollout(self) -> Any:
         """Collect a batch of frames `[B]`, worker by worker."""
-        return TensorDict.cat([frames.reshape(-1) for _, frames in self._workers.play()])
+        return TensorDict.cat([frames.reshape(-1) for _, frames in self._play()])
 
 
 class SupervisedAsyncCollector(SupervisedSyncCollector):

@@ -1,7 +1,8 @@
 """Players in this process, in others of this machine or of a Ray cluster, looked after.
 
-A player is what collects: ``play()`` returns a batch, ``set_weights(weights)`` takes new weights
-between two batches, ``close()`` ends it. A worker does one thing after another.
+A player is what collects: ``play()`` returns a batch, ``set_weights(weights)`` and
+``set_training(modes)`` take what is new between two batches, ``close()`` ends it. A worker does one
+thing after another.
 """
 
 from __future__ import annotations
@@ -45,6 +46,12 @@ def spawn_seeds(seed: int, count: int) -> list[int]:
     return np.random.SeedSequence(seed).generate_state(count).tolist()
 
 
+def set_training(player: Any, modes: dict[str, bool]) -> None:
+    """Put the modules of a player's policy into these training modes, between two batches."""
+    for name, module in player.policy.named_modules():
+        module.training = modes.get(name, module.training)
+
+
 class Workers:
     """Players in this process, in processes of their own, or in the actors of a Ray cluster.
 
@@ -69,7 +76,7 @@ class Workers:
         remote_configs: dict[str, Any] | None = None,
     ) -> None:
         self._sync = sync
-        self._weights: list[TensorDictBase | None] = [None] * len(makers)
+        self._news: list[dict[str, Any]] = [{} for _ in makers]
         self._playing: dict[Future[Any], int] = {}
         if backend == "ray" and ray is None:
             raise ModuleNotFoundError("backend='ray' needs the extra 'ray' of this package.")
@@ -94,10 +101,14 @@ class Workers:
 
     def set_weights(self, weights: TensorDictBase) -> None:
         """Give all players these weights before whatever they do next, or at once."""
+        self.tell("set_weights", weights if self._workers[0].is_idle else weights.detach().clone())
+
+    def tell(self, name: str, news: Any) -> None:
+        """Call a method of all players with this before whatever they do next, or at once."""
         if self._workers[0].is_idle:
-            self.call("set_weights", [weights])
+            self.call(name, [news])
         else:
-            self._weights = [weights.detach().clone()] * len(self)
+            self._news = [{**own, name: news} for own in self._news]
 
     def play(self) -> list[tuple[int, Any]]:
         """Return all workers' batches, or that of the first one to finish, each with its worker."""
@@ -138,9 +149,9 @@ class Workers:
         self._playing[self._submit(worker, "play")] = worker
 
     def _submit(self, worker: int, name: str, *arguments: Any) -> Future[Any]:
-        weights, self._weights[worker] = self._weights[worker], None
+        news, self._news[worker] = self._news[worker], {}
         try:
-            return self._workers[worker].submit(weights, name, *arguments)
+            return self._workers[worker].submit(news, name, *arguments)
         except BrokenProcessPool as error:
             raise self._death(worker) from error
 
@@ -162,15 +173,15 @@ class _Host:
 
     player: Any
 
-    def call(self, weights: TensorDictBase | None, name: str, *arguments: Any) -> Any:
-        """Let the player take new weights, if any, and do something."""
+    def call(self, news: dict[str, Any], name: str, *arguments: Any) -> Any:
+        """Let the player take news, such as new weights, and do something."""
         if name == "start":
             make, seed = arguments
             torch.manual_seed(seed)
             self.player = make()
             return None
-        if weights is not None:
-            self.player.set_weights(weights)
+        for method, value in news.items():
+            getattr(self.player, method)(value)
         return getattr(self.player, name)(*arguments)
 
 
@@ -192,7 +203,7 @@ class _Here(_Worker, _Host):
 
     is_idle = True
 
-    def submit(self, weights: TensorDictBase | None, name: str, *arguments: Any) -> Future[Any]:
+    def submit(self, news: dict[str, Any], name: str, *arguments: Any) -> Future[Any]:
         future: Future[Any] = Future()
         if name == "start":  # the random numbers are this process's
             self.player = arguments[0]()
@@ -200,7 +211,7 @@ class _Here(_Worker, _Host):
             return future
         self.is_idle = False
         try:
-            future.set_result(self.call(weights, name, *arguments))
+            future.set_result(self.call(news, name, *arguments))
         finally:
             self.is_idle = True
         return future

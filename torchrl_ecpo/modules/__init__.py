@@ -7,6 +7,7 @@ from torchrl_ecpo.modules.actor_critic import (
     make_tanh_gaussian_actor,
     make_value_network,
 )
+from torchrl_ecpo.modules.latents import record_latents
 from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
 from torchrl_ecpo.modules.softmax import LinearSoftmax, SharedCategorical, make_softmax_policy
 from torchrl_ecpo.modules.tuple_policy import TupleCategorical, make_tuple_policy
@@ -23,4 +24,5 @@ __all__ = [
     "make_tanh_gaussian_actor",
     "make_tuple_policy",
     "make_value_network",
+    "record_latents",
 ]

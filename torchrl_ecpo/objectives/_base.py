@@ -72,6 +72,7 @@ class PolicyLoss(LossModule):
         for name, value in self._as_temperatures(temperatures or {}).items():
             self.register_coeff_buffer(name, value, device=self._device)
         self.temperature_names = tuple(temperatures or ())
+        self.register_load_state_dict_pre_hook(_check_loaded)
 
     @property
     def _device(self) -> torch.device | None:
@@ -139,6 +140,11 @@ class PolicyLoss(LossModule):
     def temperatures(self) -> tuple[Tensor, ...]:
         """Those that :attr:`temperature_names` names, as they stand: tau and tau'."""
         return tuple(self.temperature(name) for name in self.temperature_names)
+
+    def _all_temperatures(self) -> dict[str, Tensor]:
+        """Those that are scheduled and those that are learned, as they stand."""
+        names = dict.fromkeys((*self.temperature_names, *self._learned))
+        return {name: self.temperature(name) for name in names}
 
     def dual(self, name: str, excess: Tensor, mean_excess: Tensor | None = None) -> Tensor:
         """Loss of a learned temperature: up where a constraint is exceeded, else down.
@@ -269,13 +275,19 @@ class PolicyLoss(LossModule):
                     "'max_weight' of trajectories are computed from weights that are not None)."
                 )
 
-    @staticmethod
-    def _check_values(quantities: Mapping[str, Tensor], *, of: str = "places") -> None:
+    def _check_values(self, quantities: Mapping[str, Tensor], *, of: str = "places") -> None:
         """Refuse values that would silently spoil the networks. One look; none when compiled."""
         if not values_can_be_seen():
             return
-        if math.isfinite(sum(values.detach().sum() for values in quantities.values())):
+        temperatures = self._all_temperatures()
+        total = sum(values.detach().sum() for values in quantities.values())
+        # What is written in place is seen here: roots and logarithms of the forbidden are NaN.
+        total = total + sum(temperature.sqrt() for temperature in temperatures.values())
+        if temperatures and not self._allow_zero:
+            total = total + sum(temperatures.values()).log()  # pyright: ignore
+        if math.isfinite(total):
             return
+        self._as_temperatures(temperatures)
         for name, values in quantities.items():
             strange = ~values.isfinite()
             if strange.any():
@@ -284,6 +296,17 @@ class PolicyLoss(LossModule):
                     f"{of}. Mend the environment, the observations or the networks that it comes "
                     "from."
                 )
+
+
+def _check_loaded(module: Any, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
+    """Refuse temperatures of a state dict that could not be set."""
+    values = module._all_temperatures()
+    for name in values:
+        if prefix + name in state_dict:
+            values[name] = state_dict[prefix + name]
+        elif f"{prefix}log_{name}" in state_dict:
+            values[name] = state_dict[f"{prefix}log_{name}"].exp()
+    module._as_temperatures(values)
 
 
 class Reduction(NamedTuple):

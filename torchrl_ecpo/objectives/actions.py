@@ -17,7 +17,6 @@ from torch.distributions import (
     Independent,
     Normal,
     OneHotCategorical,
-    TransformedDistribution,
 )
 
 from torchrl_ecpo.functional import (
@@ -26,6 +25,7 @@ from torchrl_ecpo.functional import (
     log_mean_exp,
     soft_value,
 )
+from torchrl_ecpo.modules.latents import split
 
 __all__ = [
     "Actions",
@@ -82,7 +82,7 @@ class SampledActions(NamedTuple):
         Log-probabilities are those of the latent that was drawn: a saturated tanh is never
         inverted.
         """
-        base, transforms = _split(distribution)
+        base, transforms = split(distribution)
         latent = base.rsample(torch.Size([num_samples]))
         action, log_volume = latent, 0.0
         for transform in transforms:
@@ -93,7 +93,7 @@ class SampledActions(NamedTuple):
 
     def log_prob_of(self, distribution: Distribution) -> Tensor:
         """Log-probability ``[M, *B]`` under another policy of the same transform."""
-        return _split(distribution)[0].log_prob(self.latent) - self.log_volume
+        return split(distribution)[0].log_prob(self.latent) - self.log_volume
 
     def mean(self, values: Tensor) -> Tensor:
         """Expectation ``[*B]`` under the policy of values ``[M, *B]``."""
@@ -180,7 +180,7 @@ def gaussian_parameters(distribution: Distribution) -> tuple[Tensor, Tensor]:
     Raises:
         ValueError: if it is not a diagonal Gaussian, transformed or not.
     """
-    base, _ = _split(distribution)
+    base, _ = split(distribution)
     normal = base.base_dist if isinstance(base, Independent) else base
     if not isinstance(normal, Normal):
         raise ValueError(
@@ -188,12 +188,6 @@ def gaussian_parameters(distribution: Distribution) -> tuple[Tensor, Tensor]:
             f'not, got {type(distribution).__name__}. Use projection="paper", which takes any.'
         )
     return normal.loc, normal.scale
-
-
-def _split(distribution: Distribution) -> tuple[Distribution, list]:
-    if isinstance(distribution, TransformedDistribution):
-        return distribution.base_dist, distribution.transforms
-    return distribution, []
 
 
 def _impossible(like: Tensor) -> float:

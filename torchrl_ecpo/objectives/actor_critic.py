@@ -29,6 +29,7 @@ from torchrl_ecpo.checks import (
     as_float,
     check_choice,
     check_count,
+    check_real,
     get_entry,
 )
 from torchrl_ecpo.functional import (
@@ -274,7 +275,8 @@ class ActorCriticLoss(PolicyLoss):
         """Compute all losses of a batch of transitions ``[*B]``.
 
         Args:
-            tensordict: with the entries of :attr:`in_keys`; the priority is written into it.
+            tensordict: with the entries of :attr:`in_keys`; the priority is written into it. (One
+                that is locked, as memory-mapped and shared ones are, takes it where it has it.)
 
         Returns:
             The entries of :attr:`out_keys`, losses and, detached, metrics; with
@@ -310,7 +312,11 @@ class ActorCriticLoss(PolicyLoss):
             metrics = self._metrics(states, surrogate)
         losses |= self._temperature_losses(lift.actions, metrics, of_states)
         priority = td_error if mask is None else td_error.where(mask, 0.0)
-        tensordict.set(self.tensor_keys.priority, priority)
+        key = self.tensor_keys.priority
+        if not tensordict.is_locked:
+            tensordict.set(key, priority)
+        elif tensordict.get(key, None) is not None:
+            tensordict.set_(key, priority)
         metrics["tau"], metrics["tau_prime"] = self.temperatures()
         outputs = {
             "loss_qvalue": of_all.loss(errors.sum(0)),
@@ -650,6 +656,7 @@ class ActorCriticLoss(PolicyLoss):
             raise ValueError(
                 f"The reward {self._reward_key!r} must have the shape [*B, 1], got {tuple(shape)}."
             )
+        check_real(self._reward_key, tensordict.get(self._reward_key))
         for name in ("done", "terminated"):
             key = unravel_key(("next", getattr(self.tensor_keys, name)))
             if tensordict.get(key).shape != shape:

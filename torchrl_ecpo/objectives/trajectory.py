@@ -11,22 +11,40 @@ import torch
 from tensordict import TensorDictBase, TensorDictParams, is_tensor_collection
 from tensordict.nn import (
     CompositeDistribution,
-    ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
     TensorDictSequential,
     composite_lp_aggregate,
     dispatch,
 )
+from tensordict.nn import ProbabilisticTensorDictModule as _Head
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torch.distributions import Categorical
 
-from torchrl_ecpo.checks import check_group_size, check_padding, get_entry, values_can_be_seen
+from torchrl_ecpo.checks import (
+    check_group_size,
+    check_integers,
+    check_padding,
+    check_real,
+    get_entry,
+    values_can_be_seen,
+)
 from torchrl_ecpo.functional import (
     Surrogate,
     effective_sample_size,
     lifted_log_weights,
     self_normalised_weights,
     uniform_weights,
+)
+from torchrl_ecpo.groups import DONE_KEY, GROUP_KEY
+from torchrl_ecpo.modules.latents import (
+    invert,
+    is_lost,
+    latent_key,
+    log_prob_of_latent,
+    may_squash,
+    parts_of,
+    split,
 )
 from torchrl_ecpo.objectives._base import PolicyLoss, Reduction
 
@@ -88,7 +106,16 @@ class TrajectoryGroupLoss(PolicyLoss):
 
     Real steps are those that :attr:`loss_mask_key` marks, by default TorchRL's own
     ``("collector", "mask")`` where it is present. A trajectory without a real step is left out of
-    its group. Whatever stands in padded steps has no influence.
+    its group. Whatever stands in padded steps has no influence. Where every step is an end, as
+    ``("next", "done")`` tells, the batch is one of one-step trajectories, ``[*G, K]``.
+
+    A squashed action (``TanhNormal``, any ``TransformedDistribution``) is evaluated at the latent
+    that was drawn, where that is recorded: ``"action_latent"`` for ``"action"``, as
+    :func:`~torchrl_ecpo.modules.record_latents` lets a policy write it and the package's collector
+    does. Otherwise the transform is inverted, which near the ends of the range, and in half
+    precision everywhere, gives another latent. Where the distribution's parameters are recorded
+    beside the action (an actor writes them), the policy that drew it is then evaluated at that
+    latent too, so that its ratio to itself is 1; the gradient is not that of the latent.
 
     Args:
         actor_network: a policy with ``get_dist``: feed-forward or recurrent (it is called in
@@ -110,8 +137,9 @@ class TrajectoryGroupLoss(PolicyLoss):
 
     Raises:
         ValueError: for an unknown reduction or a temperature that is not allowed; when called, for
-            a wrong shape, a group of one, also one that the mask leaves, a mask with a hole, a
-            reward or log-probability that is not finite. (``torch.compile`` and ``torch.vmap``
+            a wrong shape, a group of one, also one that the mask leaves, a mask with a hole, rows
+            that mix groups (``"group"``) or go on after an end (``("next", "done")``), a reward,
+            log-probability or temperature that is not finite. (``torch.compile`` and ``torch.vmap``
             look at shapes only: NaN then gives NaN, and a mask without a real step gives 0.)
         TypeError: if ``actor_network`` has no ``get_dist``.
         KeyError: when called, for a missing entry.
@@ -178,6 +206,7 @@ class TrajectoryGroupLoss(PolicyLoss):
             reduction=reduction,
         )
         self._check_names()
+        self._may_squash = any(map(may_squash, self._heads))
 
     # ------------------------------------------------------------------------------- one method
 
@@ -226,11 +255,29 @@ class TrajectoryGroupLoss(PolicyLoss):
             self._reward_key,
             *_as_list(self.tensor_keys.sample_log_prob),
             *self.mask_keys[:1],
+            *self._latent_keys,
         ]
 
     @property
     def _all_out_keys(self) -> list[Any]:
         return ["loss_actor", *self.losses, *self.metrics, *OF_GROUPS]
+
+    @property
+    def _heads(self) -> list[_Head]:
+        return [m for m in self.actor_network.modules() if isinstance(m, _Head)]
+
+    @property
+    def _latent_keys(self) -> list[NestedKey]:
+        """Where what was drawn before a squashing may be recorded."""
+        return [latent_key(k) for k in _as_list(self.tensor_keys.action) if self._may_squash]
+
+    def make_value_estimator(self, *args: Any, **hyperparams: Any) -> Any:
+        """Refused: there are no values to estimate."""
+        raise NotImplementedError(
+            f"{type(self).__name__} has no value estimator: the return of a trajectory is the "
+            f"undiscounted sum of {self._reward_key!r}. To discount by gamma, multiply the reward "
+            "of step t by gamma ** t before calling the loss."
+        )
 
     # ---------------------------------------------------------------------------------- reading
 
@@ -245,8 +292,10 @@ class TrajectoryGroupLoss(PolicyLoss):
         quantities = {f"entry {self._reward_key!r}": returns}
         if behaviour is not reference or not self.delay_actor:  # else it is not there
             quantities[f"entry {self.tensor_keys.sample_log_prob!r}"] = behaviour
-        quantities["log-probability under the reference policy"] = reference
-        quantities["log-probability under the actor"] = log_prob
+        read = f"log-probability of the entries {_as_list(self.tensor_keys.action)}, given "
+        read += f"{self.actor_network.in_keys}, under the "
+        quantities[read + "reference policy"] = reference
+        quantities[read + "actor"] = log_prob
         self._check_values(quantities, of="trajectories")
         return TrajectoryGroups(returns, log_prob, reference, behaviour, mask, steps)
 
@@ -256,6 +305,11 @@ class TrajectoryGroupLoss(PolicyLoss):
         mask = self._mask(tensordict, shape)
         if mask is not None and values_can_be_seen():
             self._check_mask(mask)
+        every = torch.ones(shape, dtype=torch.bool, device=reward.device) if mask is None else mask
+        if values_can_be_seen() and self._lacks_time(tensordict, every):
+            steps = tensordict.copy()
+            steps.batch_size = shape
+            return self._read_steps(steps.unsqueeze(-1))
 
         def real(values: Tensor) -> Tensor:
             # A sum over a completion of 1,000 tokens would be off by nats in half precision, and
@@ -266,6 +320,8 @@ class TrajectoryGroupLoss(PolicyLoss):
         recorded = self._recorded_log_prob(tensordict, shape)
         inputs = self._actor_inputs(tensordict, shape, mask)
         log_prob = real(self._log_prob(inputs, self.actor_network_params, shape))
+        if recorded is not None and self._may_squash:
+            recorded = self._drawn_log_prob(inputs, recorded)
         if self.delay_actor:
             with torch.no_grad():
                 reference = real(self._log_prob(inputs, self.target_actor_network_params, shape))
@@ -295,7 +351,10 @@ class TrajectoryGroupLoss(PolicyLoss):
         action_keys = _as_list(self.tensor_keys.action)
         for key in action_keys:
             get_entry(tensordict, key)
-        inputs = tensordict.select(*self.actor_network.in_keys, *action_keys, strict=False)
+        keys = [*self.actor_network.in_keys, *action_keys, *self._latent_keys]
+        if self._may_squash:
+            keys += [key for head in self._heads for key in head.in_keys]
+        inputs = tensordict.select(*keys, strict=False)
         inputs = inputs.copy()  # entries that are tensordicts would get the batch size below
         try:
             inputs.batch_size = shape
@@ -319,10 +378,24 @@ class TrajectoryGroupLoss(PolicyLoss):
         action_keys = _as_list(self.tensor_keys.action)
         steps = list(_steps_of(self.actor_network))
         with params.to_module(self.actor_network, preserve_module_state=False):
-            if sum(isinstance(step, ProbabilisticTensorDictModule) for step in steps) > 1:
-                return self._log_prob_of_parts(steps, inputs, action_keys).reshape(shape)
-            dist = self.actor_network.get_dist(inputs)
-        return self._log_prob_of_action(dist, inputs, action_keys).reshape(shape)
+            try:
+                if sum(isinstance(step, _Head) for step in steps) > 1:
+                    return self._log_prob_of_parts(steps, inputs, action_keys).reshape(shape)
+                dist = self.actor_network.get_dist(inputs)
+                return self._log_prob_of_action(dist, inputs, action_keys).reshape(shape)
+            except (RuntimeError, IndexError) as error:
+                if isinstance(error, torch.OutOfMemoryError):
+                    raise
+                keys = (*self.actor_network.in_keys, *action_keys)
+                entries = [
+                    (key, value)
+                    for key in keys
+                    if isinstance(value := inputs.get(key, None), Tensor)
+                ]
+                shapes = ", ".join(f"{k!r} {v.dtype} {tuple(v.shape)}" for k, v in entries)
+                raise ValueError(
+                    f"The actor cannot be evaluated on the entries {shapes}: {error}"
+                ) from error
 
     def _log_prob_of_parts(
         self, steps: list[Any], inputs: TensorDictBase, action_keys: list[NestedKey]
@@ -333,7 +406,7 @@ class TrajectoryGroupLoss(PolicyLoss):
         """
         log_prob, drawn = torch.zeros(()), []
         for step in steps:
-            if not isinstance(step, ProbabilisticTensorDictModule):
+            if not isinstance(step, _Head):
                 inputs = step(inputs)
                 continue
             keys = list(step.dist_sample_keys)
@@ -353,15 +426,22 @@ class TrajectoryGroupLoss(PolicyLoss):
         dist: Any, inputs: TensorDictBase, action_keys: list[NestedKey]
     ) -> Tensor:
         """Log-probability ``[N, T]`` of recorded actions, under one distribution."""
-        if isinstance(dist, CompositeDistribution):
-            log_prob = _sum_parts(dist.log_prob(inputs.select(*action_keys)))
-        elif len(action_keys) == 1:
-            log_prob = _sum_parts(dist.log_prob(inputs.get(action_keys[0])))
-        else:
+        parts = parts_of(dist, action_keys)
+        is_composite = isinstance(dist, CompositeDistribution)
+        if len(action_keys) > 1 and not is_composite:
             raise ValueError(
                 f"The action has several parts {action_keys}, but the actor's distribution is a "
                 f"{type(dist).__name__}, which has one. Name it with set_keys(action=...)."
             )
+        for key, part in parts:
+            action = get_entry(inputs, key)
+            if isinstance(part, Categorical) and action.shape == part.batch_shape:
+                check_integers(key, action)
+        if any(split(part)[1] for _, part in parts):
+            log_prob: Any = sum(_log_prob_of_part(part, inputs, key) for key, part in parts)
+        else:
+            action = inputs.select(*action_keys) if is_composite else inputs.get(action_keys[0])
+            log_prob = _sum_parts(dist.log_prob(action))
         if log_prob.shape != inputs.shape:
             raise ValueError(
                 f"The actor's distribution {type(dist).__name__} gives log-probabilities of shape "
@@ -379,6 +459,7 @@ class TrajectoryGroupLoss(PolicyLoss):
         total = torch.zeros(())
         for key in keys:
             value = _sum_parts(get_entry(tensordict, key))
+            check_real(key, value)
             if value.shape != shape:
                 raise ValueError(
                     f"The log-probability {key!r} must have the shape [*G, K, T] = {tuple(shape)}, "
@@ -388,6 +469,52 @@ class TrajectoryGroupLoss(PolicyLoss):
                 )
             total = total + value.detach()
         return total
+
+    def _drawn_log_prob(self, inputs: TensorDictBase, recorded: Tensor) -> Tensor:
+        """The recorded log-probability; of lost latents, that at the ones that stand for them.
+
+        It is computed from recorded parameters of the distribution, if they are there.
+        """
+        if any(inputs.get(key, None) is None for head in self._heads for key in head.in_keys):
+            return recorded
+        log_prob: Any = 0.0
+        lost = torch.zeros(inputs.shape, dtype=torch.bool, device=recorded.device)
+        with torch.no_grad():
+            for head in self._heads:
+                several = len(self._heads) > 1
+                keys = head.dist_sample_keys if several else _as_list(self.tensor_keys.action)
+                dist = head.get_dist(inputs)
+                log_prob = log_prob + self._log_prob_of_action(dist, inputs, keys)
+                for key, part in parts_of(dist, keys):
+                    if split(part)[1] and inputs.get(latent_key(key), None) is None:
+                        lost = lost | is_lost(part, inputs.get(key))
+        lost, log_prob = lost.reshape(recorded.shape), log_prob.reshape(recorded.shape)
+        return log_prob.to(recorded.dtype).where(lost, recorded)
+
+    def _lacks_time(self, tensordict: TensorDictBase, real: Tensor) -> bool:
+        """Whether every step is an end: one-step trajectories ``[*G, K]``.
+
+        Refuses other rows that are no trajectories of one group, as far as entries tell. One look.
+        """
+        faults = {}
+        done, group = (tensordict.get(key, None) for key in (DONE_KEY, GROUP_KEY))
+        if done is not None and done.numel() == real.numel():
+            done = done.reshape(real.shape).bool()
+            faults[f"go on after an end ({DONE_KEY!r})"] = done[..., :-1] & real[..., 1:]
+        if group is not None and group.numel() == real.numel():
+            group = group.reshape(real.shape)
+            other = (group != group[..., :1, :1]) & real
+            faults[f"are of another group ({GROUP_KEY!r}) than the first"] = other
+        if not faults or not torch.stack([where.any() for where in faults.values()]).any():
+            return False
+        fault, where = next((f, where) for f, where in faults.items() if where.any())
+        if done is not None and where.shape != real.shape and (done | ~real).all():
+            return True
+        raise ValueError(
+            f"{int(where.any(-1).sum())} rows of the batch [*G, K, T] = {tuple(real.shape)} "
+            f"{fault}. Each row is one trajectory, and the K rows of a group are of one problem "
+            "instance."
+        )
 
     def _check_mask(self, mask: Tensor) -> None:
         """Refuse holes, and groups of which too little is left."""
@@ -439,6 +566,16 @@ class LiftProjectLoss(TrajectoryGroupLoss):
 # ------------------------------------------------------------------------------------- small parts
 
 
+def _log_prob_of_part(distribution: Any, inputs: TensorDictBase, key: NestedKey) -> Tensor:
+    """At the latent of a squashed action, recorded or not."""
+    action, latent = get_entry(inputs, key), inputs.get(latent_key(key), None)
+    if not split(distribution)[1]:
+        return distribution.log_prob(action)
+    return log_prob_of_latent(
+        distribution, invert(distribution, action) if latent is None else latent
+    )
+
+
 def _steps_of(module: Any) -> Iterator[Any]:
     """The modules that a policy calls one after the other."""
     if isinstance(module, TensorDictSequential):
@@ -470,6 +607,7 @@ def _batch_shape(reward: Tensor, key: NestedKey) -> torch.Size:
         raise ValueError(
             f"The batch is empty: the reward {key!r} has the shape {tuple(reward.shape)}."
         )
+    check_real(key, reward)
     check_group_size(reward.shape[-3], f"K of the batch [*G, K, T] = {tuple(reward.shape[:-1])}")
     return reward.shape[:-1]
 
