@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, is_non_tensor
 from tensordict.utils import NestedKey
 from torch import Tensor
 
@@ -57,7 +57,7 @@ def check_real(key: NestedKey, values: Tensor) -> None:
 
 def check_integers(key: NestedKey, values: Tensor) -> None:
     """Refuse other numbers, which would be cut to integers."""
-    if values.is_floating_point() or values.is_complex():
+    if values.is_floating_point() or values.is_complex() or values.dtype == torch.bool:
         raise ValueError(f"The entry {key!r} must hold integers, got {values.dtype}.")
 
 
@@ -89,7 +89,33 @@ def get_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
             f"The entry {key!r} is missing; there are {present(tensordict)}. If it has another "
             "name, say so with set_keys(...), or where the networks are built."
         )
+    if not isinstance(value, (Tensor, TensorDictBase)) or is_non_tensor(value):
+        raise TypeError(f"The entry {key!r} must be a tensor, got {type(value).__name__}.")
     return value
+
+
+UNREADABLE = (RuntimeError, IndexError, TypeError, AttributeError, KeyError)
+"""What a network raises when it is given what it cannot read."""
+
+
+def unreadable(
+    network: str, tensordict: TensorDictBase, keys: Sequence[NestedKey], error: Exception
+) -> Exception:
+    """An error that names the entries which a network could not read."""
+    if isinstance(error, torch.OutOfMemoryError):
+        raise error
+    told = []
+    for key in keys:
+        value = tensordict.get(key, None)
+        if value is None:
+            told.append(f"{key!r} (missing)")
+        elif isinstance(value, Tensor):
+            told.append(f"{key!r} {value.dtype} {tuple(value.shape)}")
+        else:
+            told.append(f"{key!r} ({type(value).__name__})")
+    reason = str(error).strip().splitlines()[0]
+    kind = KeyError if isinstance(error, KeyError) else ValueError
+    return kind(f"The {network} cannot be evaluated on {', '.join(told)}: {reason}")
 
 
 def present(tensordict: TensorDictBase) -> str:

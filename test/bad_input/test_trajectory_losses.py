@@ -5,17 +5,22 @@ from __future__ import annotations
 import pytest
 import torch
 from faults import Subject, check, tensordict_of
-from trajectory_problems import CASES, MASK, make_actor, sample
+from trajectory_problems import CASES, LIFTING, MASK, make_actor, sample
 
 OPTIONS = ("tau", "tau_prime", "delay_actor", "reduction", "control_variate")
 SHAPE = (2, 3, 4)
+NAMES = "names of groups, which agree within each"
+FINE = {("group", fault): NAMES for fault in ("text", "complex", "halves", "flags")}
 
 
 def good(kind, *, dtype=torch.float64):
     batch = sample(make_actor(kind, dtype=dtype), *SHAPE)
     keys = ("observation", "action", "action_log_prob", ("next", "reward"))
     mask = torch.arange(4) < torch.tensor([[4, 1, 3], [2, 4, 3]]).unsqueeze(-1)
-    return {key: batch[key] for key in keys} | {MASK: mask, "group": torch.tensor([[0], [1]]).unsqueeze(-1).expand(SHAPE)}
+    return {key: batch[key] for key in keys} | {
+        MASK: mask,
+        "group": torch.tensor([[0], [1]]).unsqueeze(-1).expand(SHAPE),
+    }
 
 
 def call(case, kind):
@@ -34,11 +39,13 @@ def call(case, kind):
 
 def subject(name, kind):
     case = CASES[name]
-    options = {**case.temperatures, "delay_actor": False, "reduction": "none"}
+    options = {**case.temperatures, "reduction": "none"}
+    if name in LIFTING:
+        options["delay_actor"] = False
     if name == "ecpo":
         options["control_variate"] = False
-    optional = (MASK, *options)
-    return Subject(call(case, kind), good(kind) | options, optional=optional)
+    entries = good(kind) | options
+    return Subject(call(case, kind), entries, fine=FINE, optional=(MASK, "group", *options))
 
 
 @pytest.mark.parametrize("kind", ["categorical", "normal"])

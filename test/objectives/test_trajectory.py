@@ -626,11 +626,11 @@ BAD_BATCHES = {
     ),
     "observation of another length": (
         *(_set("observation", lambda x: x[..., :2]), ValueError),
-        r"cannot be evaluated on the entries 'observation' torch.float64 \(6, 4, 2\), 'action'",
+        r"cannot be evaluated on 'observation' torch.float64 \(6, 4, 2\), 'action'",
     ),
     "action out of range": (
         *(_poke("action", 9), ValueError),
-        r"actor cannot be evaluated on the entries .*'action' torch.int64 \(6, 4\).*out of bounds",
+        r"actor cannot be evaluated on .*'action' torch.int64 \(6, 4\).*out of bounds",
     ),
     "action that is no index": (
         *(_set("action", lambda x: x + 0.5), ValueError),

@@ -22,11 +22,13 @@ from torch import Tensor
 from torch.distributions import Categorical
 
 from torchrl_ecpo.checks import (
+    UNREADABLE,
     check_group_size,
     check_integers,
     check_padding,
     check_real,
     get_entry,
+    unreadable,
     values_can_be_seen,
 )
 from torchrl_ecpo.functional import (
@@ -383,19 +385,9 @@ class TrajectoryGroupLoss(PolicyLoss):
                     return self._log_prob_of_parts(steps, inputs, action_keys).reshape(shape)
                 dist = self.actor_network.get_dist(inputs)
                 return self._log_prob_of_action(dist, inputs, action_keys).reshape(shape)
-            except (RuntimeError, IndexError) as error:
-                if isinstance(error, torch.OutOfMemoryError):
-                    raise
+            except UNREADABLE as error:
                 keys = (*self.actor_network.in_keys, *action_keys)
-                entries = [
-                    (key, value)
-                    for key in keys
-                    if isinstance(value := inputs.get(key, None), Tensor)
-                ]
-                shapes = ", ".join(f"{k!r} {v.dtype} {tuple(v.shape)}" for k, v in entries)
-                raise ValueError(
-                    f"The actor cannot be evaluated on the entries {shapes}: {error}"
-                ) from error
+                raise unreadable("actor", inputs, keys, error) from error
 
     def _log_prob_of_parts(
         self, steps: list[Any], inputs: TensorDictBase, action_keys: list[NestedKey]
@@ -435,6 +427,7 @@ class TrajectoryGroupLoss(PolicyLoss):
             )
         for key, part in parts:
             action = get_entry(inputs, key)
+            check_real(key, action)
             if isinstance(part, Categorical) and action.shape == part.batch_shape:
                 check_integers(key, action)
         if any(split(part)[1] for _, part in parts):
