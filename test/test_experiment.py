@@ -128,6 +128,13 @@ def test_a_record_that_another_program_spoils_is_written_anew(tmp_path, capsys, 
     assert not capsys.readouterr().err
 
 
+def test_a_record_that_is_removed_after_the_last_row_is_there_in_the_end(tmp_path):
+    with make_run(tmp_path) as run:
+        record(run)
+        (tmp_path / "metrics.csv").unlink()
+    assert read_metrics(tmp_path)["step"] == [10, 20, 30]
+
+
 def test_a_record_whose_directory_is_removed_ends_the_run(tmp_path):
     table = MetricsTable(tmp_path / "run/metrics.csv")
     table.path.parent.mkdir()

@@ -95,24 +95,15 @@ class MetricsTable:
     def log_metrics(self, metrics: Mapping[str, float], step: int) -> None:
         """Append a row. A new column rewrites the file, with empty cells in earlier rows.
 
-        A file that another program has changed or removed is written anew with all rows, with a
-        message.
-
         Raises:
             ValueError: if the step is not beyond that of the row before.
         """
         if self.rows and not step > self.rows[-1]["step"]:
             raise ValueError(f"step must grow, got {step} after {self.rows[-1]['step']}.")
+        self.restore()
         row = {"step": step, **metrics}
         self.rows.append(row)
-        is_changed = self._written is not None and self._written != self._stat()
-        if is_changed:
-            print(
-                f"{self.path} was changed or removed by another program: it is written anew, with "
-                "all rows of this run.",
-                file=sys.stderr,
-            )
-        if is_changed or any(name not in self._columns for name in row):
+        if any(name not in self._columns for name in row):
             self._columns = _columns(self.rows)
             self._rewrite(_table(self._columns, self.rows))
             return
@@ -121,6 +112,16 @@ class MetricsTable:
             file.write(text)
         self._sha256.update(text.encode())
         self._written = self._stat()
+
+    def restore(self) -> None:
+        """Write all rows anew, and say so, if another program has changed or removed the file."""
+        if self._written not in (None, self._stat()):
+            self._rewrite(_table(self._columns, self.rows))
+            print(
+                f"{self.path} was changed or removed by another program: it is written anew, with "
+                "all rows of this run.",
+                file=sys.stderr,
+            )
 
     def _stat(self) -> tuple[int, ...] | None:
         """What differs once another program has changed the file; None if it has removed it."""
@@ -351,6 +352,7 @@ class Run:
             self._logger.close()
         if not self.table.rows:
             return
+        self.table.restore()
         summary = {
             "finished": error is None,
             "seconds": round(time.monotonic() - self._started, 1),
