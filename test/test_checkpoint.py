@@ -29,7 +29,7 @@ from torchrl_ecpo import ECPOLoss
 from torchrl_ecpo.envs import EpisodeReplay
 from torchrl_ecpo.experiment import Checkpoints, Progress, Run
 from torchrl_ecpo.experiment._files import check_files, read_manifest, seal
-from torchrl_ecpo.experiment.checkpoint import run_directory
+from torchrl_ecpo.experiment.checkpoint import _differences, run_directory
 
 SCRIPT_MODULES = ("utils", "tasks", "stack", "score_sac", "ecpo", "ecac")
 SCRIPTS = Path(__file__).parents[1] / "sota-implementations"
@@ -393,6 +393,19 @@ def test_counters_that_are_no_integers_are_refused(tmp_path):
     message = r"progress\.frames must be an integer of at least 0, got 0\.5"
     with pytest.raises(ValueError, match=message):
         found.attach(found.run, Progress(frames=0.5))
+
+
+def test_options_in_which_the_same_run_may_differ():
+    old = {
+        "seed": 0,
+        "compile": False,
+        "resume": None,
+        "checkpoint": {"keep": 2},
+        "total_frames": 9,
+    }
+    new = {"seed": 0, "compile": True, "resume": "auto", "checkpoint": None, "total_frames": 10}
+    assert _differences(old, new) == []
+    assert _differences(new, old) == ["total_frames was 10, is 9"]
 
 
 def test_a_second_signal_does_not_wait(tmp_path):

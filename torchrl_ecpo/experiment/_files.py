@@ -63,8 +63,13 @@ def check_files(path: Path, manifest: dict[str, Any]) -> None:
         CheckpointError: naming files that are missing, have changed, or do not belong to it.
     """
     hashes, present = manifest["files"], _contents(path)
+    more = present - hashes.keys()
     wrong = [f"{name} is missing" for name in sorted(hashes.keys() - present)]
-    wrong += [f"{name} does not belong to it" for name in sorted(present - hashes.keys())]
+    wrong += [
+        f"{name} does not belong to it"
+        for name in sorted(more)
+        if name.rpartition("/")[0] not in more  # nor is what is in such a folder named
+    ]
     wrong += [
         f"{name} has changed"
         for name in sorted(hashes.keys() & present)
