@@ -45,7 +45,7 @@ test: install ## run every test that takes less than some ten seconds
 test-slow: install ## run the tests that take longer
 	$(RUN) -m pytest -n auto -q -m slow
 
-test-faults: install ## kill runs at random moments, fill a disk, and resume
+test-faults: install ## kill runs at random moments, damage checkpoints, fill a disk, and resume
 	$(RUN) -m pytest -q -m slow test/test_faults.py
 
 lint: install ## check style and formatting

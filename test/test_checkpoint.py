@@ -6,7 +6,9 @@ import csv
 import importlib
 import io
 import os
+import pickle
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,13 +21,15 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
+from tensordict import NonTensorData, TensorDict
 from torchrl.checkpoint import Checkpoint, CheckpointError
 from torchrl.envs import DMControlEnv, GymEnv, TransformedEnv
 
 from torchrl_ecpo import ECPOLoss
 from torchrl_ecpo.envs import EpisodeReplay
-from torchrl_ecpo.experiment import Checkpoints
-from torchrl_ecpo.experiment.checkpoint import run_directory
+from torchrl_ecpo.experiment import Checkpoints, Progress, Run
+from torchrl_ecpo.experiment._files import check_files, read_manifest, seal
+from torchrl_ecpo.experiment.checkpoint import _differences, run_directory
 
 SCRIPT_MODULES = ("utils", "tasks", "stack", "score_sac", "ecpo", "ecac")
 SCRIPTS = Path(__file__).parents[1] / "sota-implementations"
@@ -170,19 +174,20 @@ def test_a_full_disk_ends_the_run_and_leaves_the_last_checkpoint(interrupted, st
     assert_same_run(interrupted, interrupted / "whole")
 
 
-def truncate(directory):
+def flip_a_bit(directory):
     (path,) = checkpoints(directory)
     file = next(path.glob("components/*loss_module/state.pt"))
-    file.write_bytes(file.read_bytes()[:-100])
-
-
-def truncate_manifest(directory):
-    (path,) = checkpoints(directory)
-    (path / "manifest.json").write_text('{"format": "torchrl.ch')
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
 
 
 def make_foreign(directory):
     Checkpoint(value={"step": 1}).save(checkpoints(directory)[0])
+
+
+def remove_checkpoints(directory):
+    shutil.rmtree(directory / "checkpoints")
 
 
 def cut_record(directory):
@@ -190,13 +195,21 @@ def cut_record(directory):
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:3]))
 
 
+def change_record(directory):
+    path = directory / "metrics.csv"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join([*lines[:2], lines[2].replace(".", ".1", 1), *lines[3:]]))
+
+
 @pytest.mark.parametrize(
     ("spoil", "options", "message"),
     [
-        (truncate, (), "checkpoint-0*20 cannot be restored: .*'loss_module'.* remove it"),
-        (truncate_manifest, (), "nothing to resume from, for .*checkpoints holds no checkpoint"),
+        (flip_a_bit, (), "checkpoint-0*20 is damaged: .*loss_module/state.pt has changed"),
+        (flip_a_bit, ("resume=auto",), "checkpoint-0*20 is damaged: .*loss_module/state.pt has"),
+        (remove_checkpoints, (), "nothing to resume from, for .*checkpoints holds no checkpoint"),
         (make_foreign, (), "checkpoint-0*20 is no checkpoint of a run of this script"),
         (cut_record, (), "metrics.csv does not reach to step 20"),
+        (change_record, (), "metrics.csv does not reach to step 20, .* with the rows that were"),
         (None, ("loss.tau=1", "seed=7"), "loss.tau was 0.01, is 1; seed was 0, is 7. Resume with"),
         (None, ("resume=elsewhere",), "resume=elsewhere is not this run's directory"),
         (None, ("resume=null", "checkpoint.keep=0"), "checkpoint.keep must be an integer of at"),
@@ -205,14 +218,201 @@ def cut_record(directory):
     ],
 )
 def test_what_cannot_be_resumed_is_refused(interrupted, start, spoil, options, message):
-    config = (interrupted / "config.yaml").read_text()
     if spoil is not None:
         spoil(interrupted)
+    is_seen_late = spoil in (cut_record, change_record)  # when config.yaml has been written
+    untouched = interrupted / ("checkpoints" if is_seen_late else "")
+    before = contents(untouched)
     with pytest.raises((CheckpointError, ValueError), match=message):
         start(interrupted, *RUNS["bandit"], f"resume={interrupted}", *options)
-    if "resume=null" not in options and spoil is None:
-        assert (interrupted / "config.yaml").read_text() == config
-        assert len(record(interrupted)) == 6
+    assert contents(untouched) == before
+
+
+def contents(directory):
+    """What is in all files, by name."""
+    files = directory.rglob("*")
+    return {str(file): file.read_bytes() if file.is_file() else None for file in files}
+
+
+def attach(directory, resume=None, keep=2, **parts):
+    """Checkpoints of a run that the test itself is."""
+    logger = {"backend": "csv", "project": "test", "wandb_mode": "offline"}
+    options = {"interval": None, "max_share": 1, "keep": keep}
+    config = OmegaConf.create(
+        {"seed": 0, "total_frames": 100, "resume": resume, "checkpoint": options, "logger": logger}
+    )
+    found = Checkpoints(config, directory)
+    run = Run(
+        config, total=100, unit="frames", name="test", shown=[], directory=directory, show_bar=False
+    )
+    return found.attach(run, Progress(frames=0, returns=[]), **parts)
+
+
+def save(written, step, **options):
+    written.progress.frames = step
+    written.run.log({"return": 0.5}, step)
+    written.save(**options)
+
+
+def state_file(path):
+    return path / Checkpoint.manifest(path)["components"]["net"]["path"] / "state.pt"
+
+
+class Evil:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+def put_folder_for_file(path):
+    """TorchRL's own reader unpickles what is in such a folder."""
+    file = state_file(path)
+    file.unlink()
+    evil = NonTensorData(data=Evil(path.parents[1] / "evil"))
+    TensorDict({"weight": torch.zeros(2, 2), "bias": evil}).memmap_(file.parent / "state")
+    (file.parent / "state.json").write_text('{"kind": "dict", "items": []}')
+
+
+def put_pickle(path):
+    state_file(path).write_bytes(pickle.dumps({"weight": Evil(path.parents[1] / "evil")}))
+
+
+def put_older_file(path):
+    shutil.copy(state_file(path.with_name("checkpoint-000000000005")), state_file(path))
+
+
+def change_manifest(path):
+    manifest = path / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"step": 10', '"step": 11'))
+
+
+@pytest.mark.parametrize("resume", ["auto", "directory"])
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda path: state_file(path).write_bytes(b""), "net/state.pt has changed"),
+        (lambda path: state_file(path).unlink(), "net/state.pt is missing"),
+        (put_older_file, "net/state.pt has changed"),
+        (lambda path: (path / "notes").touch(), "notes does not belong to it"),
+        (lambda path: (path / "components/more").mkdir(), "components/more does not belong to it"),
+        (lambda path: (path / "manifest.json").unlink(), "manifest.json is missing"),
+        (lambda path: (path / "manifest.json").write_text("{"), "manifest.json is missing or"),
+        (change_manifest, "manifest.json has changed"),
+        (put_pickle, "net/state.pt has changed"),
+        (put_folder_for_file, "net/state.pt is missing, .*net/state does not belong to it"),
+    ],
+)
+def test_a_damaged_checkpoint_is_refused_and_left_as_it_is(tmp_path, resume, damage, message):
+    net = torch.nn.Linear(2, 2)
+    written = attach(tmp_path, net=net)
+    save(written, 5)
+    with torch.no_grad():
+        net.weight.zero_()
+    save(written, 10)
+    damage(written.latest)
+    before = contents(tmp_path)
+    with pytest.raises(CheckpointError, match=rf"checkpoint-0*10 is damaged: .*{message}"):
+        attach(tmp_path, "auto" if resume == "auto" else str(tmp_path), net=net)
+    assert contents(tmp_path) == before
+    assert not (tmp_path / "evil").exists()
+    # The message says what helps: the one before it.
+    shutil.rmtree(written.latest)
+    assert attach(tmp_path, "auto", net=net).step == 5
+    assert net.weight.any()
+
+
+@pytest.mark.filterwarnings("ignore:TensorDict.load_memmap is loading a pickled")
+@pytest.mark.parametrize("put", [put_pickle, put_folder_for_file])
+def test_reading_runs_no_code_even_where_hashes_agree(tmp_path, put):
+    written = attach(tmp_path, net=torch.nn.Linear(2, 2))
+    save(written, 5)
+    put(written.latest)
+    seal(written.latest)
+    with pytest.raises(CheckpointError, match=r"cannot be restored: .*'net'"):
+        attach(tmp_path, "auto", net=torch.nn.Linear(2, 2))
+    assert not (tmp_path / "evil").exists()
+
+
+@pytest.mark.parametrize("keep", [1, 2])
+def test_there_is_a_whole_checkpoint_at_every_moment(tmp_path, monkeypatch, keep):
+    written = attach(tmp_path, keep=keep, net=torch.nn.Linear(2, 2), replay_buffer=Progress(x=1))
+    save(written, 5)
+    kept = []
+
+    def watched(call):
+        def look(*args, **options):
+            result = call(*args, **options)
+            check_files(written.latest, read_manifest(written.latest))
+            kept.append(len(list((tmp_path / "checkpoints").glob("checkpoint-*"))))
+            return result
+
+        return look
+
+    for owner, name in ((Path, "rename"), (os, "replace"), (shutil, "rmtree")):
+        monkeypatch.setattr(owner, name, watched(getattr(owner, name)))
+    save(written, 10)
+    save(written, 15)
+    written.save(finished=True)  # of the same step, without the replay buffer
+    assert (min(kept), max(kept), kept[-1]) == (1, keep + 1, 1)
+    assert written.latest.name == "checkpoint-000000000015-finished"
+
+
+def test_what_a_killed_write_has_left_is_removed(tmp_path, monkeypatch):
+    written = attach(tmp_path, net=torch.nn.Linear(2, 2))
+    save(written, 5)
+
+    def kill(*_, **__):
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr("torchrl_ecpo.experiment.checkpoint.seal", kill)
+        with pytest.raises(Killed):
+            save(written, 10)
+    (tmp_path / "checkpoints/..checkpoint-000000000010.stage-0").mkdir()  # TorchRL's
+    assert written.latest.name == "checkpoint-000000000005"
+    save(written, 15)
+    names = [path.name for path in checkpoints(tmp_path)]
+    assert names == ["checkpoint-000000000005", "checkpoint-000000000015"]
+
+
+def test_saved_counters_are_not_shared_with_the_run():
+    progress, other = Progress(returns=[1.0]), Progress(returns=[])
+    state = progress.state_dict()
+    progress.returns.append(2.0)
+    other.load_state_dict(state)
+    other.returns.append(3.0)
+    assert state == {"returns": [1.0]}
+
+
+def test_counters_that_are_no_integers_are_refused(tmp_path):
+    found = attach(tmp_path)
+    message = r"progress\.frames must be an integer of at least 0, got 0\.5"
+    with pytest.raises(ValueError, match=message):
+        found.attach(found.run, Progress(frames=0.5))
+
+
+def test_options_in_which_the_same_run_may_differ():
+    old = {
+        "seed": 0,
+        "compile": False,
+        "resume": None,
+        "checkpoint": {"keep": 2},
+        "total_frames": 9,
+    }
+    new = {"seed": 0, "compile": True, "resume": "auto", "checkpoint": None, "total_frames": 10}
+    assert _differences(old, new) == []
+    assert _differences(new, old) == ["total_frames was 10, is 9"]
+
+
+def test_a_second_signal_does_not_wait(tmp_path):
+    with attach(tmp_path):
+        os.kill(os.getpid(), signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
 
 
 @pytest.mark.parametrize("save_at", [None, 1])
@@ -242,6 +442,14 @@ def test_the_command_that_resumes_is_one_that_hydra_reads(tmp_path, name):
     assert not parsed.is_sweep_override()
 
 
+def test_a_finished_run_can_be_prolonged(tmp_path, start):
+    longer = (*RUNS["bandit"], "total_trajectories=90", "checkpoint.keep=1")
+    start(tmp_path, *RUNS["bandit"])
+    start(tmp_path, *longer, "resume=auto")
+    start(tmp_path / "whole", *longer)
+    assert_same_run(tmp_path, tmp_path / "whole")
+
+
 def test_a_finished_run_stays_as_it_is(tmp_path, start, capfd):
     run = (*RUNS["pendulum"], "total_frames=120")
     start(tmp_path, *run)
@@ -249,7 +457,12 @@ def test_a_finished_run_stays_as_it_is(tmp_path, start, capfd):
     assert "replay_buffer" not in Checkpoint.manifest(path)["components"]
     start(tmp_path, *run, "resume=auto")
     assert record(tmp_path) == rows
+    assert checkpoints(tmp_path) == [path]
     assert "which had finished" in capfd.readouterr().out
+    # Nor can it be prolonged, for the buffer is gone.
+    with pytest.raises(CheckpointError, match="had finished, and has no replay_buffer: begin a"):
+        start(tmp_path, *run, "total_frames=160", "resume=auto")
+    assert record(tmp_path) == rows
 
 
 @pytest.mark.parametrize("kind", ["loss", "gradient", "parameter"])

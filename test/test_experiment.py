@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 
 import numpy as np
 import pytest
@@ -111,6 +112,63 @@ def test_table_in_memory_and_on_disk_agree(tmp_path):
     table.log_metrics({"b": 2.5}, step=2)
     assert table.rows == [{"step": 1, "a": 1.5}, {"step": 2, "b": 2.5}]
     assert (tmp_path / "metrics.csv").read_text().split() == ["step,a,b", "1,1.5,", "2,,2.5"]
+
+
+@pytest.mark.parametrize("damage", ["", "step,a\n1,9.5\n", None])
+def test_a_record_that_another_program_spoils_is_written_anew(tmp_path, capsys, damage):
+    table, path = MetricsTable(tmp_path / "metrics.csv"), tmp_path / "metrics.csv"
+    table.log_metrics({"a": 1.5}, step=1)
+    table.log_metrics({"a": 2.5}, step=2)
+    assert not capsys.readouterr().err
+    path.unlink() if damage is None else path.write_text(damage)
+    table.log_metrics({"a": 3.5}, step=3)
+    assert f"{path} was changed or removed by another program" in capsys.readouterr().err
+    table.log_metrics({"a": 4.5}, step=4)
+    assert path.read_text().split() == ["step,a", "1,1.5", "2,2.5", "3,3.5", "4,4.5"]
+    assert not capsys.readouterr().err
+
+
+def test_a_record_that_is_removed_after_the_last_row_is_there_in_the_end(tmp_path):
+    with make_run(tmp_path) as run:
+        record(run)
+        (tmp_path / "metrics.csv").unlink()
+    assert read_metrics(tmp_path)["step"] == [10, 20, 30]
+
+
+def test_a_record_whose_directory_is_removed_ends_the_run(tmp_path):
+    table = MetricsTable(tmp_path / "run/metrics.csv")
+    table.path.parent.mkdir()
+    table.log_metrics({"a": 1.5}, step=1)
+    shutil.rmtree(table.path.parent)
+    with pytest.raises(FileNotFoundError, match="metrics"):
+        table.log_metrics({"a": 2.5}, step=2)
+
+
+@pytest.mark.parametrize("number", [int, float])
+def test_steps_grow_also_after_resuming(tmp_path, number):
+    run = make_run(tmp_path)
+    for step in (10, 20):
+        run.log({"return": 0.1 * step}, number(step))
+    state, path = run.state_dict(), tmp_path / "metrics.csv"
+    written = path.read_text()
+    run.log({"return": 1.0, "evaluation": 2.0}, number(30))
+    resumed = make_run(tmp_path)
+    resumed.load_state_dict(state)
+    assert path.read_text() == written
+    assert resumed.state_dict()["record"] == state["record"]
+    for each in (run, resumed):
+        with pytest.raises(ValueError, match=r"step must grow, got 20(\.0)? after"):
+            each.log({"return": 1.0}, number(20))
+    resumed.log({"return": 1.0}, number(25))
+    assert path.read_text().split()[-1] == f"{number(25)},1.0"
+
+
+def test_a_state_is_loaded_before_the_first_row(tmp_path):
+    state = make_run(tmp_path).state_dict()
+    resumed = make_run(tmp_path)
+    resumed.load_state_dict(state)
+    record(resumed)
+    assert read_metrics(tmp_path)["step"] == [10, 20, 30]
 
 
 @pytest.fixture

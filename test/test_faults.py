@@ -6,22 +6,31 @@ import csv
 import importlib
 import os
 import random
+import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
 import traceback
+from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
-from torchrl.checkpoint import Checkpoint
+from torchrl.checkpoint import Checkpoint, CheckpointError
+
+from torchrl_ecpo.experiment import Checkpoints
 
 pytestmark = pytest.mark.slow
 
 SCRIPTS = Path(__file__).parents[1] / "sota-implementations"
-KILLS = 20
+KILLS = {"bandit": 140, "copy": 20, "pendulum": 20, "hopper": 20}
+DAMAGES = (
+    *("a bit", "a block", "an end", "another checkpoint's file", "a file gone", "a file more"),
+)
 CONTROL = (
     *("ecac", "log_interval=8", "evaluation.interval=160", "evaluation.episodes=1"),
     *("collector.init_random_frames=80", "hidden_sizes=[16,16]", "replay_buffer.batch_size=16"),
@@ -38,9 +47,18 @@ RUNS = {
 }
 
 
+@cache
+def composed(script, *options):
+    """The configuration of a script that writes a checkpoint wherever it may."""
+    with initialize_config_dir(str(SCRIPTS / script / "config"), version_base="1.3"):
+        often = ("checkpoint.interval=0", "checkpoint.max_share=1", "resume=auto")
+        return compose("config", [*often, *options])
+
+
 def fork(directory, script, *options):
     """Start a script in a process of its own, in a directory; return the process id."""
     directory.mkdir(exist_ok=True)
+    config = composed(script, *options)
     process = os.fork()
     if process:
         return process
@@ -50,9 +68,6 @@ def fork(directory, script, *options):
         sys.stdout = sys.stderr = os.fdopen(log, "w", buffering=1)
         torch.set_num_threads(1)
         sys.path.insert(0, str(SCRIPTS / script))
-        with initialize_config_dir(str(SCRIPTS / script / "config"), version_base="1.3"):
-            often = ("checkpoint.interval=0", "checkpoint.max_share=1", "resume=auto")
-            config = compose("config", [*often, *options])
         importlib.import_module(script).main.__wrapped__(config)
         code = 0
     except BaseException:
@@ -93,22 +108,27 @@ def assert_same_run(one, other):
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_killed_at_twenty_random_moments(tmp_path, capsys, name):
+def test_killed_at_random_moments(tmp_path, capsys, name):
     run, whole, killed = RUNS[name], tmp_path / "whole", tmp_path / "killed"
+    if name == "bandit":
+        run = (*run, "checkpoint.keep=1")
     code, output = finish(whole, *run)
     assert code == 0, output
     rows = len(record(whole))
     generator = random.Random(name)
     within_writes = 0
-    for moment in sorted(generator.sample(range(rows - 5), KILLS)):
+    for moment in sorted(generator.sample(range(rows - 5), KILLS[name])):
         process = fork(killed, *run)
-        while number_of_rows(killed) < moment:
-            time.sleep(0.005)
-            assert os.waitpid(process, os.WNOHANG)[0] == 0, (killed / "log").read_text()
-        time.sleep(generator.uniform(0.0, 0.02))
+        if generator.random() < 0.2:  # while it begins, or resumes
+            time.sleep(generator.uniform(0.0, 1.0))
+        else:
+            while number_of_rows(killed) < moment:
+                time.sleep(0.005)
+                assert os.waitpid(process, os.WNOHANG)[0] == 0, (killed / "log").read_text()
+            time.sleep(generator.uniform(0.0, 0.02))
         os.kill(process, signal.SIGKILL)
         assert os.WTERMSIG(os.waitpid(process, 0)[1]) == signal.SIGKILL
-        within_writes += any((killed / "checkpoints").glob(".checkpoint-*"))
+        within_writes += any((killed / "checkpoints").glob(".*checkpoint-*"))
     code, output = finish(killed, *run)
     assert code == 0, output
     assert "Resumed from" in output
@@ -116,9 +136,67 @@ def test_killed_at_twenty_random_moments(tmp_path, capsys, name):
     assert within_writes >= 1
     with capsys.disabled():
         print(
-            f"\n{name}: {KILLS} times killed, {within_writes} of them within a checkpoint's "
+            f"\n{name}: {KILLS[name]} times killed, {within_writes} of them within a checkpoint's "
             f"writing; all {rows} rows and the final weights equal the run's that was not killed"
         )
+
+
+def spoil(path, other, generator):
+    """Damage a checkpoint; return how, and which file of it."""
+    files = [file for file in sorted(path.rglob("*")) if file.is_file()]
+    kind = generator.choice(DAMAGES)
+    if kind == "another checkpoint's file":
+        files = [f for f in files if f.read_bytes() != (other / f.relative_to(path)).read_bytes()]
+    file = generator.choice(files)
+    content = bytearray(file.read_bytes())
+    at = generator.randrange(len(content))
+    if kind == "a bit":
+        content[at] ^= 1 << generator.randrange(8)
+    elif kind == "a block":
+        content[at : at + 512] = bytes(255 - byte for byte in content[at : at + 512])
+    elif kind == "an end":
+        del content[at:]
+    elif kind == "another checkpoint's file":
+        content = (other / file.relative_to(path)).read_bytes()
+    if kind == "a file gone":
+        file.unlink()
+    elif kind == "a file more":
+        file = file.with_name(file.name + ".more")
+        file.touch()
+    else:
+        file.write_bytes(content)
+    is_other_manifest = kind == "another checkpoint's file" and file.parent == path
+    return kind, "state.pt" if is_other_manifest else file.relative_to(path).as_posix()
+
+
+def contents(directory):
+    return {path: path.is_file() and path.read_bytes() for path in directory.rglob("*")}
+
+
+def test_a_hundred_damages(tmp_path, capsys):
+    run, source, copy = RUNS["pendulum"], tmp_path / "run", tmp_path / "copy"
+    process = fork(source, *run)
+    while number_of_rows(source) < 20:
+        time.sleep(0.005)
+        assert os.waitpid(process, os.WNOHANG)[0] == 0, (source / "log").read_text()
+    os.kill(process, signal.SIGTERM)
+    os.waitpid(process, 0)
+    config = composed(*run)
+    whole = Checkpoints(config, source)
+    generator, found = random.Random(0), Counter()
+    for _ in range(100):
+        shutil.copytree(source, copy)
+        older, newest = sorted((copy / "checkpoints").iterdir())
+        assert newest.name == whole.source.name
+        kind, name = spoil(newest, older, generator)
+        before = contents(copy)
+        with pytest.raises(CheckpointError, match=re.escape(name)):
+            Checkpoints(config, copy)
+        assert contents(copy) == before
+        found[kind] += 1
+        shutil.rmtree(copy)
+    with capsys.disabled():
+        print(f"\n100 damages, each refused by the name of the file: {dict(found)}")
 
 
 def test_a_disk_that_is_full(tmp_path, capsys):

@@ -34,9 +34,6 @@ EXTENSION_POINTS = {
     "_fields",
     "_replace",
 }
-STILL_TO_CLEAN = {
-    "sota-implementations/ecac/utils.py",
-}
 
 
 @pytest.mark.parametrize("module", [_torch, _torchrl], ids=lambda module: module.__name__)
@@ -96,9 +93,6 @@ def foreign_private_names(tree: ast.AST, ours: set[str]) -> list[str]:
 def test_private_names_of_others_stand_in_one_file(path):
     found = foreign_private_names(TREES[path], OURS)
     if path in FOR_PRIVATE_NAMES:
-        return
-    if path in STILL_TO_CLEAN:
-        assert found, f"{path} is clean: take it off STILL_TO_CLEAN"
         return
     assert not found, f"{path} uses private names of other packages: {found}"
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import torch
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector
 from torchrl.data.replay_buffers import ReplayBuffer, Storage
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.envs import EnvBase
@@ -14,6 +16,7 @@ PRIVATE_NAMES: tuple[tuple[object, str], ...] = (
     (EnvBase, "_step_proc_data"),  # overridden by AlgorithmicEnv: saves a tenth of a step
     (Storage, "_attached_entities"),
     (Sampler, "_rng"),
+    (Collector, "_make_carrier"),  # which makes each instance's `_carrier`
 )
 """Names used here; ``test/test_private_names.py`` says which one a new version has lost."""
 
@@ -51,3 +54,16 @@ def generator_of(sampler: Sampler) -> torch.Generator | None:
     The buffer hands it to its sampler under this name alone.
     """
     return sampler._rng
+
+
+def carrier_of(collector: Collector) -> TensorDictBase:
+    """What one step of a collector hands to the next.
+
+    A collector's state dict leaves it out, so that one that is loaded would begin a new episode.
+    """
+    return collector._carrier
+
+
+def set_carrier(collector: Collector, carrier: TensorDictBase) -> None:
+    """Let a collector go on from there."""
+    collector._carrier = carrier

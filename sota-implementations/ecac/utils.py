@@ -42,6 +42,7 @@ from torchrl_ecpo import (
     TemperatureScheduler,
     UpdaterSequence,
 )
+from torchrl_ecpo._torchrl import carrier_of, generator_of, set_carrier
 from torchrl_ecpo.collectors import SupervisedAsyncCollector, SupervisedSyncCollector
 from torchrl_ecpo.envs import EpisodeReplay
 from torchrl_ecpo.experiment import check_options
@@ -308,7 +309,7 @@ class CollectorState:
         """What TorchRL saves, and what one step hands to the next."""
         if not self.is_single:
             return {}
-        return {**self.collector.state_dict(), "carrier": self.collector._carrier.to_dict()}
+        return {**self.collector.state_dict(), "carrier": carrier_of(self.collector).to_dict()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Put the simulator where it was, and go on from the step that was handed on."""
@@ -317,7 +318,7 @@ class CollectorState:
             self.collector.load_state_dict(
                 {name: value for name, value in state_dict.items() if name != "carrier"}
             )
-            self.collector._carrier = self.collector._carrier.empty().update(carrier)
+            set_carrier(self.collector, carrier_of(self.collector).empty().update(carrier))
 
 
 class BufferState:
@@ -325,22 +326,23 @@ class BufferState:
 
     def __init__(self, replay_buffer: ReplayBuffer) -> None:
         self.buffer: Any = replay_buffer
+        self.generator: Any = generator_of(replay_buffer.sampler)
 
     def state_dict(self) -> dict[str, Any]:
         """A copy of the transitions, the place to write next and the generator's state."""
         transitions = self.buffer[:].clone() if len(self.buffer) else TensorDict()
         return {
             "transitions": transitions.to_dict(),
-            "writer": self.buffer._writer.state_dict(),
-            "generator": self.buffer._rng.get_state(),
+            "writer": self.buffer.writer.state_dict(),
+            "generator": self.generator.get_state(),
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Fill an empty buffer as it was."""
         if state_dict["transitions"]:
             self.buffer.extend(TensorDict(state_dict["transitions"]).auto_batch_size_(1))
-        self.buffer._writer.load_state_dict(state_dict["writer"])
-        self.buffer._rng.set_state(state_dict["generator"])
+        self.buffer.writer.load_state_dict(state_dict["writer"])
+        self.generator.set_state(state_dict["generator"])
 
 
 # ------------------------------------------------------------------------------------- measurements

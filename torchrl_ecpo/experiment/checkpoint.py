@@ -9,6 +9,8 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Sequence
+from copy import deepcopy
 from pathlib import Path
 from types import FrameType, SimpleNamespace, TracebackType
 from typing import Any
@@ -18,14 +20,10 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.utils import to_absolute_path
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
-from torchrl.checkpoint import (
-    Checkpoint,
-    CheckpointError,
-    CheckpointRotation,
-    GlobalRNGState,
-    StateDictCheckpointAdapter,
-)
+from torchrl.checkpoint import Checkpoint, CheckpointError, GlobalRNGState
 
+from torchrl_ecpo.checks import check_count
+from torchrl_ecpo.experiment._files import StateFile, check_files, read_manifest, seal
 from torchrl_ecpo.experiment.run import Run, differences, flatten
 
 __all__ = ["Checkpoints", "Progress"]
@@ -50,11 +48,11 @@ class Progress(SimpleNamespace):
 
     def state_dict(self) -> dict[str, Any]:
         """The counters, by name."""
-        return dict(vars(self))
+        return deepcopy(vars(self))
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continue from saved counters."""
-        vars(self).update(state_dict)
+        vars(self).update(deepcopy(state_dict))
 
 
 class Checkpoints:
@@ -73,15 +71,14 @@ class Checkpoints:
         directory: of the run.
 
     Raises:
-        CheckpointError: if there is nothing to resume from, if it is no checkpoint of such a run,
-            or if the configuration is not the checkpoint's.
+        CheckpointError: if there is nothing to resume from, if the last checkpoint is damaged or
+            not of such a run, or if the configuration is not the checkpoint's.
     """
 
     def __init__(self, config: DictConfig, directory: Path | str = ".") -> None:
         self.options, self.resume = config.checkpoint, config.resume
         self.directory = Path(directory).resolve()
-        folder = self.directory / FOLDER
-        self.rotation = CheckpointRotation(folder, keep_last=config.checkpoint.keep)
+        self.folder = self.directory / FOLDER
         self.config: Any = OmegaConf.to_container(config, resolve=True)
         self.source = None if config.resume is None else self._find()
         self._stopped_by: signal.Signals | None = None
@@ -96,26 +93,45 @@ class Checkpoints:
                 "hydra.run.dir; to resume all runs of a sweep, give its hydra.sweep.dir and "
                 "resume=auto."
             )
-        source = self.rotation.latest()
+        source = self.latest
         if source is None and given != "auto":
             raise CheckpointError(
-                f"resume={given}: there is nothing to resume from, for {self.rotation.directory} "
-                "holds no checkpoint that can be read. Give the directory of a run that has "
-                "written one, or leave out resume."
+                f"resume={given}: there is nothing to resume from, for {self.folder} holds no "
+                "checkpoint. Give the directory of a run that has written one, or leave out resume."
             )
         if source is None:
             print(f"resume=auto found no checkpoint: a new run begins in {self.directory}")
             return None
-        saved = Checkpoint.manifest(source)["metadata"].get("config")
-        if saved is None:
-            raise CheckpointError(f"{source} is no checkpoint of a run of this script.")
-        differing = _differences(saved, self.config)
-        if differing:
-            raise CheckpointError(
-                f"The configuration differs from that of {source}: {'; '.join(differing)}. "
-                "Resume with the options that the run was started with."
-            )
+        try:
+            manifest = read_manifest(source)
+            self._saved = manifest["metadata"]
+            differing = _differences(self._saved["config"], self.config)
+            if differing:
+                raise CheckpointError(
+                    f"The configuration differs from that of {source}: {'; '.join(differing)}. "
+                    "Resume with the options that the run was started with."
+                )
+            check_files(source, manifest)
+        except OSError as error:
+            raise CheckpointError(f"{source} cannot be read: {error}.") from error
         return source
+
+    @property
+    def latest(self) -> Path | None:
+        """The last checkpoint, if there is one."""
+        return (self._paths() or [None])[-1]
+
+    def _paths(self) -> list[Path]:
+        """All checkpoints, the oldest first."""
+        paths = sorted(self.folder.glob("checkpoint-*"))
+        return [path for path in paths if re.fullmatch(r"checkpoint-\d+(-finished)?", path.name)]
+
+    def _remove(self, paths: Sequence[Path] = ()) -> None:
+        """Remove checkpoints, none of which is ever seen in part, and what a kill has left."""
+        for path in paths:
+            path.rename(path.with_name(f".{path.name}"))
+        for remains in self.folder.glob(".*checkpoint-*"):
+            shutil.rmtree(remains, ignore_errors=True)
 
     def attach(self, run: Run, progress: Progress, **parts: Any) -> Checkpoints:
         """Say what a checkpoint holds, and resume from one if that was asked for.
@@ -134,12 +150,10 @@ class Checkpoints:
         parts = {"run": run, "progress": progress, "random": GlobalRNGState(), **parts}
         for name, part in parts.items():
             if part is not None:
-                # One file each. It is read without unpickling anything but tensors and numbers.
-                adapter = StateDictCheckpointAdapter("torch")
-                self.checkpoint.register(name, part, adapter=adapter)
+                self.checkpoint.register(name, part, adapter=StateFile())
+        check_count(f"progress.{run.unit}", self.step, least=0)
         if self.source is None:
-            # Those of a run that was here before; its record is gone.
-            shutil.rmtree(self.rotation.directory, ignore_errors=True)
+            self._remove(self._paths())  # of a run that was here before, whose record will be gone
         else:
             self._load(self.source)
         self._saved_step = self.step if self.source is not None else None
@@ -152,7 +166,7 @@ class Checkpoints:
         return getattr(self.progress, self.run.unit)
 
     def _load(self, source: Path) -> None:
-        metadata = Checkpoint.manifest(source)["metadata"]
+        metadata = self._saved
         names = set(self.checkpoint.components)
         if metadata["finished"]:
             left_out = names & ONLY_TO_GO_ON
@@ -167,10 +181,7 @@ class Checkpoints:
             self.checkpoint.load(source, components=names - {"random"})
             self.checkpoint.load(source, components={"random"})
         except (CheckpointError, OSError) as error:
-            raise CheckpointError(
-                f"{source} cannot be restored: {error}. If it is damaged, remove it to resume from "
-                "the checkpoint before it."
-            ) from error
+            raise CheckpointError(f"{source} cannot be restored: {error}") from error
         print(f"Resumed from {source}" + (", which had finished" if metadata["finished"] else ""))
 
     def boundary(self) -> None:
@@ -195,27 +206,30 @@ class Checkpoints:
             FloatingPointError: if a parameter is not finite.
             CheckpointError: if it cannot be written. Those before it are untouched.
         """
-        if self.step == self._saved_step and not finished:
+        # A name of its own: what is there is not replaced, so that there always is a checkpoint.
+        path = self.folder / f"checkpoint-{self.step:012d}{'-finished' * finished}"
+        if path.exists() or (self.step == self._saved_step and not finished):
             return
         self._check_parameters()
         started = time.monotonic()
         names = set(self.checkpoint.components) - (ONLY_TO_GO_ON if finished else set())
+        written = path.with_name(f".{path.name}")
         try:
-            for remains in self.rotation.directory.glob(f".{self.rotation.prefix}-*"):
-                shutil.rmtree(remains, ignore_errors=True)  # of a write that was killed
-            self.rotation.save(
-                self.checkpoint,
-                step=self.step,
+            self._remove()
+            self.checkpoint.save(
+                written,
                 components=names,
                 metadata={"config": self.config, "step": self.step, "finished": finished},
             )
+            seal(written)
+            written.rename(path)
+            self._remove(self._paths()[: -1 if finished else -self.options.keep])
         except (OSError, RuntimeError) as error:
+            shutil.rmtree(written, ignore_errors=True)
             raise CheckpointError(
                 f"The checkpoint at {self.run.unit} {self.step} could not be written: {error}. "
-                f"The last good one is {self.rotation.latest()}."
+                f"The last good one is {self.latest}."
             ) from error
-        if finished:
-            CheckpointRotation(self.rotation.directory, keep_last=1).prune()
         self._saved_step, self._saved_at = self.step, time.monotonic()
         self._pause = (self._saved_at - started) / self.options.max_share
 
@@ -225,7 +239,7 @@ class Checkpoints:
                 if not value.isfinite().all():
                     raise FloatingPointError(
                         f"No checkpoint is written at {self.run.unit} {self.step}: {name} of "
-                        f"{part} is not finite. The last good one is {self.rotation.latest()}."
+                        f"{part} is not finite. The last good one is {self.latest}."
                     )
 
     @property

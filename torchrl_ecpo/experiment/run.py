@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import importlib.metadata
+import io
 import json
 import math
 import os
@@ -11,6 +13,7 @@ import platform
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -86,47 +89,107 @@ class MetricsTable:
         self.path = path
         self.rows: list[dict[str, float]] = []
         self._columns: list[str] = []
+        self._sha256 = hashlib.sha256()
+        self._written: tuple[int, ...] | None = None
 
     def log_metrics(self, metrics: Mapping[str, float], step: int) -> None:
-        """Append a row. A new column rewrites the file, with empty cells in earlier rows."""
+        """Append a row. A new column rewrites the file, with empty cells in earlier rows.
+
+        Raises:
+            ValueError: if the step is not beyond that of the row before.
+        """
+        if self.rows and not step > self.rows[-1]["step"]:
+            raise ValueError(f"step must grow, got {step} after {self.rows[-1]['step']}.")
+        self.restore()
         row = {"step": step, **metrics}
         self.rows.append(row)
         if any(name not in self._columns for name in row):
-            self._rewrite()
+            self._columns = _columns(self.rows)
+            self._rewrite(_table(self._columns, self.rows))
             return
+        text = _table(self._columns, [row], with_header=False)
         with self.path.open("a", newline="") as file:
-            csv.DictWriter(file, self._columns).writerow(row)
+            file.write(text)
+        self._sha256.update(text.encode())
+        self._written = self._stat()
 
-    def _rewrite(self) -> None:
-        """Write all rows to another file, so that a run which is killed meanwhile loses none."""
-        self._columns = list(dict.fromkeys(name for row in self.rows for name in row))
+    def restore(self) -> None:
+        """Write all rows anew, and say so, if another program has changed or removed the file."""
+        if self._written not in (None, self._stat()):
+            self._rewrite(_table(self._columns, self.rows))
+            print(
+                f"{self.path} was changed or removed by another program: it is written anew, with "
+                "all rows of this run.",
+                file=sys.stderr,
+            )
+
+    def _stat(self) -> tuple[int, ...] | None:
+        """What differs once another program has changed the file; None if it has removed it."""
+        with suppress(FileNotFoundError):
+            stat = self.path.stat()
+            return stat.st_ino, stat.st_size, stat.st_mtime_ns
+
+    def _rewrite(self, text: str) -> None:
+        """Write another file first, so that a run which is killed meanwhile loses no row."""
         written = self.path.with_suffix(".part")
         with written.open("w", newline="") as file:
-            writer = csv.DictWriter(file, self._columns)
-            writer.writeheader()
-            writer.writerows(self.rows)
+            file.write(text)
         os.replace(written, self.path)
+        self._sha256 = hashlib.sha256(text.encode())
+        self._written = self._stat()
 
-    def cut_back(self, step: int) -> None:
+    @property
+    def sha256(self) -> str:
+        """Hash of the table."""
+        return self._sha256.hexdigest()
+
+    def cut_back(self, step: int, sha256: str | None = None) -> None:
         """Continue the file as it was at a step: later rows and half a row are dropped.
 
+        Args:
+            step: of the last row.
+            sha256: of the table at that step; None: not compared.
+
         Raises:
-            ValueError: if the file does not reach to that step.
+            ValueError: if the file does not reach to that step, or was another then.
         """
-        self.rows = []
-        if self.path.is_file():
-            with self.path.open(newline="") as file:
-                for cells in csv.DictReader(file):
-                    if None in cells.values() or int(cells["step"]) > step:
-                        break
-                    row = {name: float(cell) for name, cell in cells.items() if cell}
-                    self.rows.append({**row, "step": int(cells["step"])})
-        if step != (self.rows[-1]["step"] if self.rows else 0):
+        rows: list[dict[str, float]] = []
+        # A row that cannot be read is the last.
+        with (
+            suppress(FileNotFoundError, ValueError, TypeError, KeyError, csv.Error),
+            self.path.open(newline="") as file,
+        ):
+            for cells in csv.DictReader(file):
+                row = {name: float(cell) for name, cell in cells.items() if cell}
+                row["step"] = json.loads(cells["step"])
+                if None in cells.values() or row["step"] > step:
+                    break
+                rows.append(row)
+        columns = _columns(rows)
+        text = _table(columns, rows)
+        is_other = sha256 not in (None, hashlib.sha256(text.encode()).hexdigest())
+        if is_other or step != (rows[-1]["step"] if rows else 0):
             raise ValueError(
-                f"{self.path} does not reach to step {step}, where the run goes on: put back the "
-                "rows that are missing."
+                f"{self.path} does not reach to step {step}, where the run goes on, with the rows "
+                "that were logged: put back those that are missing or were changed."
             )
-        self._rewrite()
+        self.rows, self._columns = rows, columns
+        self._rewrite(text)
+
+
+def _columns(rows: Sequence[Mapping[str, float]]) -> list[str]:
+    return list(dict.fromkeys(name for row in rows for name in row))
+
+
+def _table(
+    columns: Sequence[str], rows: Sequence[Mapping[str, float]], *, with_header: bool = True
+) -> str:
+    file = io.StringIO()
+    writer = csv.DictWriter(file, columns)
+    if with_header and columns:
+        writer.writeheader()
+    writer.writerows(rows)
+    return file.getvalue()
 
 
 def read_metrics(run_directory: Path | str) -> dict[str, list[float]]:
@@ -255,15 +318,20 @@ class Run:
     def state_dict(self) -> dict[str, Any]:
         """Where the record stands."""
         seconds = time.monotonic() - self._started
-        return {"step": self.step, "latest": dict(self._latest), "seconds": seconds}
+        return {
+            "step": self.step,
+            "record": self.table.sha256,
+            "latest": dict(self._latest),
+            "seconds": seconds,
+        }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on there: the record is cut back to it.
 
         Raises:
-            ValueError: if the record does not reach there.
+            ValueError: if the record does not reach there, or was another.
         """
-        self.table.cut_back(state_dict["step"])
+        self.table.cut_back(state_dict["step"], state_dict["record"])
         self.step, self._latest = state_dict["step"], dict(state_dict["latest"])
         self._started = time.monotonic() - state_dict["seconds"]
         self._bar.initial = self._bar.n = self.step
@@ -284,6 +352,7 @@ class Run:
             self._logger.close()
         if not self.table.rows:
             return
+        self.table.restore()
         summary = {
             "finished": error is None,
             "seconds": round(time.monotonic() - self._started, 1),
