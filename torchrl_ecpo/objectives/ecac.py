@@ -94,7 +94,7 @@ class ECACLoss(ActorCriticLoss):
     their range), ``qvalue``, ``state_value``, ``tau`` and ``tau_prime``. The
     temporal difference error is written into the input as ``"td_error"``, 0 where the entry
     ``("collector", "mask")`` says that a transition is not real: such transitions are not looked
-    at, whatever stands there.
+    at, whatever stands there. A locked batch keeps the ``"td_error"`` out, unless it has one.
 
     Raises:
         ValueError: for discrete or hybrid actions, a Q network that reads no action, a value
