@@ -531,8 +531,8 @@ class Stranger(Countdown):
 @pytest.mark.parametrize(
     ("options", "error", "match"),
     [
-        ({"group_size": 1}, ValueError, "group_size of at least 2, got num_groups=2, group_size=1"),
-        ({"num_groups": 0}, ValueError, "num_groups of at least 1"),
+        ({"group_size": 1}, ValueError, "group_size must be an integer of at least 2"),
+        ({"num_groups": 0}, ValueError, "num_groups must be an integer of at least 1"),
         ({"group_size": 4}, ValueError, r"\[\*B, group_size=4\], got \(2, 3\)"),
         ({"num_groups": 3}, ValueError, "num_groups=3 must be a multiple.*, 2"),
         ({"group_key": "instance"}, KeyError, "no .*instance.*GroupedEnv"),

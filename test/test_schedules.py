@@ -7,7 +7,9 @@ import pytest
 import torch
 from torchrl.objectives import LossModule
 
+from torchrl_ecpo import ECPOLoss
 from torchrl_ecpo.functional import theorem1_temperatures
+from torchrl_ecpo.modules import make_softmax_policy
 from torchrl_ecpo.schedules import (
     TemperatureScheduler,
     constant,
@@ -92,6 +94,25 @@ def test_scheduler_continues_from_its_state():
 
 
 @pytest.mark.parametrize(
+    ("schedules", "message"),
+    [
+        ({"tau": (0.5, 0.0), "tau_prime": (0.2, 0.0)}, r"end: tau \+ tau_prime must be positive"),
+        ({"tau": (0.5, 0.0)}, r"end: tau \+ tau_prime must be positive"),  # the other is 0
+        ({"tau": (0.5, -1.0)}, "end: tau must be a finite number >= 0, got -1.0"),
+    ],
+)
+def test_schedules_that_end_where_the_loss_is_not_defined(schedules, message):
+    """Refused at once, not when they have come there; a function may end anywhere."""
+    loss = ECPOLoss(make_softmax_policy(torch.eye(3)), tau_prime=0.0)
+    lines = {name: linear(*ends, 10) for name, ends in schedules.items()}
+    with pytest.raises(ValueError, match=message):
+        TemperatureScheduler(loss, **lines)
+    TemperatureScheduler(loss, tau=linear(0.5, 0.0, 10), tau_prime=lambda count: 0.1)
+    with pytest.raises(TypeError, match=r"schedule of tau must be a function.*constant\(0.5\)"):
+        TemperatureScheduler(loss, tau=0.5)
+
+
+@pytest.mark.parametrize(
     ("setting", "at_five"),
     [
         (0.3, 0.3),
@@ -115,7 +136,17 @@ def test_schedule_from_a_configuration(setting, at_five):
         (lambda: make_schedule({"start": 1.0}), "got None"),
         (lambda: make_schedule({"schedule": "linear", "start": 1.0}), "Wrong arguments.*'end'"),
         (lambda: TemperatureScheduler(Loss(), tua=constant(1.0)), r"no temperature 'tua'.*'tau'"),
-        (lambda: linear(1.0, 0.0, math.nan), "duration must be positive, got nan"),
+        (lambda: linear(1.0, 0.0, math.nan), "duration must be finite, got nan"),
+        (lambda: linear("a", 0.0, 5), "start must be a number, got 'a'"),
+        (lambda: constant(math.inf), "start must be finite, got inf"),
+        (lambda: make_schedule("high"), "no mapping must be a number, got 'high'"),
+        (lambda: make_schedule({"schedule": ["linear"]}), r"one of .*got \['linear'\]"),
+        (lambda: theorem1_schedules(1), "num_trajectories must be at least 2"),
+        (
+            lambda: TemperatureScheduler(Loss()).step(-1),
+            "count must be at least 0 and finite, got -1",
+        ),
+        (lambda: TemperatureScheduler(Loss()).step(math.nan), "count must be at least 0 .*got nan"),
     ],
 )
 def test_bad_input_is_refused(make, message):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase, is_non_tensor
 from tensordict.utils import NestedKey
@@ -19,16 +21,27 @@ def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
         raise ValueError(f"{name} must be one of {choices}, got {value!r}.")
 
 
-def check_count(name: str, value: Any, *, least: int = 1, reason: str = "") -> None:
-    """Refuse what is not an integer of at least so many."""
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+def check_count(name: str, value: Any, *, least: int = 1, reason: str = "") -> int:
+    """An integer of at least so many, numpy's too, as Python's own; refuse anything else."""
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
         raise ValueError(f"{name} must be an integer of at least {least}{reason}, got {value!r}.")
+    return int(value)
 
 
-def check_group_size(size: Any, name: str = "group_size") -> None:
-    """Refuse a K below 2."""
+def check_flag(name: str, value: Any, *others: Any) -> Any:
+    """True, False or one of the others; refuse anything else, such as ``"no"``, which is true."""
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if not any(value is other or (isinstance(other, str) and value == other) for other in others):
+        choices = ", ".join(map(repr, (True, False, *others)))
+        raise ValueError(f"{name} must be one of {choices}, got {value!r}.")
+    return value
+
+
+def check_group_size(size: Any, name: str = "group_size") -> int:
+    """A K of at least 2; refuse anything else."""
     reason = ": a trajectory is weighed against the others of its group"
-    check_count(name, size, least=2, reason=reason)
+    return check_count(name, size, least=2, reason=reason)
 
 
 def check_mask(key: NestedKey, mask: Tensor, shape: torch.Size) -> Tensor:
@@ -124,8 +137,10 @@ def present(tensordict: TensorDictBase) -> str:
 
 
 def as_float(name: str, value: Any) -> float:
-    """A number from an option."""
+    """A number from an option; no text, and no flag."""
     try:
+        if isinstance(value, (str, bool)):
+            raise TypeError
         return float(value)
     except (TypeError, ValueError, RuntimeError):
         raise ValueError(f"{name} must be a number, got {value!r}.") from None

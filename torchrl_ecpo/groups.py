@@ -20,6 +20,7 @@ from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl_ecpo._torchrl import buffers_of, generator_of
 from torchrl_ecpo.checks import (
     check_count,
+    check_flag,
     check_group_size,
     check_mask,
     check_padding,
@@ -419,12 +420,9 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
         done_key: NestedKey = DONE_KEY,
     ) -> None:
         """Make the sampler; the class describes the arguments."""
-        check_group_size(group_size)
-        if num_groups is not None:
-            check_count("num_groups", num_groups)
-        self.group_size = group_size
-        self.num_groups = num_groups
-        self.replacement = replacement
+        self.group_size = check_group_size(group_size)
+        self.num_groups = None if num_groups is None else check_count("num_groups", num_groups)
+        self.replacement = check_flag("replacement", replacement)
         self.group_key, self.traj_key, self.done_key = group_key, traj_key, done_key
         self._empty()
 

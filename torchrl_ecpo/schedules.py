@@ -6,6 +6,7 @@ project steps, lifts or trajectories; :class:`TemperatureScheduler` counts what 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -13,7 +14,9 @@ from typing import Any
 from torchrl.objectives import LossModule
 
 from torchrl_ecpo._torchrl import schedulable_buffers
+from torchrl_ecpo.checks import as_float
 from torchrl_ecpo.functional import theorem1_temperatures
+from torchrl_ecpo.objectives._base import PolicyLoss
 
 __all__ = [
     "Schedule",
@@ -35,7 +38,7 @@ def constant(value: float) -> Schedule:
         >>> constant(0.5)(1_000)
         0.5
     """
-    return partial(_linear, start=value, end=value, duration=1.0)
+    return _schedule(_linear, start=value, end=value, duration=1.0)
 
 
 def linear(start: float, end: float, duration: float) -> Schedule:
@@ -46,8 +49,7 @@ def linear(start: float, end: float, duration: float) -> Schedule:
         >>> [tau_prime(count) for count in (0, 50, 100, 200)]
         [0.02, 0.01, 0.0, 0.0]
     """
-    _check_duration(duration)
-    return partial(_linear, start=start, end=end, duration=duration)
+    return _schedule(_linear, start=start, end=end, duration=duration)
 
 
 def exponential(start: float, end: float, duration: float) -> Schedule:
@@ -58,13 +60,13 @@ def exponential(start: float, end: float, duration: float) -> Schedule:
         >>> [round(tau_prime(count), 6) for count in (0, 50, 100, 200)]
         [0.02, 0.002, 0.0002, 0.0002]
     """
-    _check_duration(duration)
+    schedule = _schedule(_exponential, start=start, end=end, duration=duration)
     if not (start > 0 and end > 0):
         raise ValueError(
             f"An exponential schedule needs start > 0 and end > 0, got {start} and {end}. "
             "Use a linear one to reach 0."
         )
-    return partial(_exponential, start=start, end=end, duration=duration)
+    return schedule
 
 
 def theorem1_schedules(num_trajectories: int, *, horizon: int | None = None) -> dict[str, Schedule]:
@@ -79,6 +81,7 @@ def theorem1_schedules(num_trajectories: int, *, horizon: int | None = None) -> 
         >>> [round(schedules["tau_prime"](count), 3) for count in (0, 99)]
         [0.466, 0.066]
     """
+    theorem1_temperatures(1 if horizon is None else horizon, num_trajectories)  # or is refused
     return {
         name: partial(_theorem1, index=index, num_trajectories=num_trajectories, horizon=horizon)
         for index, name in enumerate(("tau", "tau_prime"))
@@ -97,10 +100,10 @@ def make_schedule(setting: float | Mapping[str, Any]) -> Schedule:
         0.5
     """
     if not isinstance(setting, Mapping):
-        return constant(float(setting))
+        return constant(as_float("A schedule that is no mapping", setting))
     arguments = dict(setting)
     kind = arguments.pop("schedule", None)
-    if kind not in _SCHEDULES:
+    if kind not in [*_SCHEDULES]:
         raise ValueError(f"schedule must be one of {sorted(_SCHEDULES)}, got {kind!r}.")
     try:
         return _SCHEDULES[kind](**arguments)
@@ -124,7 +127,9 @@ class TemperatureScheduler:
             at 0 are written at once.
 
     Raises:
-        ValueError: if the loss has no schedulable temperature of that name.
+        ValueError: if the loss has no schedulable temperature of that name, or if the temperatures
+            at 0, or those with which the schedules of this module end, are not allowed together.
+        TypeError: for a schedule that is no function, such as a number.
         AttributeError: if the loss learns it.
 
     Examples:
@@ -140,19 +145,32 @@ class TemperatureScheduler:
 
     def __init__(self, loss_module: LossModule, **schedules: Schedule) -> None:
         known = getattr(loss_module, "temperature_names", None) or schedulable_buffers(loss_module)
-        for name in schedules:
+        for name, schedule in schedules.items():
             if name not in known:
                 raise ValueError(
                     f"{type(loss_module).__name__} has no temperature {name!r} to schedule; "
                     f"it has {list(known)}."
                 )
+            if not callable(schedule):
+                raise TypeError(
+                    f"The schedule of {name} must be a function of a count, such as "
+                    f"constant({schedule!r}), got {schedule!r}."
+                )
         self.loss_module = loss_module
         self.schedules = schedules
         self.count = 0.0
         self._write()
+        if isinstance(loss_module, PolicyLoss):
+            ends = {name: getattr(s, "keywords", {}).get("end") for name, s in schedules.items()}
+            try:
+                loss_module.allowed_temperatures(**ends)
+            except ValueError as error:
+                raise ValueError(f"Where the schedules end: {error}") from None
 
     def step(self, count: float = 1) -> None:
-        """Advance by ``count`` and write the temperatures."""
+        """Advance by ``count``, at least 0, and write the temperatures."""
+        if not 0 <= as_float("count", count) < math.inf:
+            raise ValueError(f"count must be at least 0 and finite, got {count}.")
         self.count += count
         self._write()
 
@@ -192,6 +210,11 @@ def _theorem1(count: float, index: int, num_trajectories: int, horizon: int | No
     return theorem1_temperatures(lift, num_trajectories)[index]
 
 
-def _check_duration(duration: float) -> None:
-    if not duration > 0:
-        raise ValueError(f"duration must be positive, got {duration}.")
+def _schedule(function: Callable[..., float], **numbers: Any) -> Schedule:
+    """From a start to an end; refuse what are no numbers."""
+    for name, value in numbers.items():
+        if not math.isfinite(as_float(name, value)):
+            raise ValueError(f"{name} must be finite, got {value}.")
+    if not numbers["duration"] > 0:
+        raise ValueError(f"duration must be positive, got {numbers['duration']}.")
+    return partial(function, **numbers)

@@ -52,11 +52,13 @@ import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import torch
+from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule, TargetNetUpdater
 
 from torchrl_ecpo._torchrl import networks_with_updater
-from torchrl_ecpo.checks import check_count
+from torchrl_ecpo.checks import as_float, check_count
 
 __all__ = ["PeriodicCopy", "PolyakAverage", "UpdaterSequence"]
 
@@ -64,10 +66,11 @@ __all__ = ["PeriodicCopy", "PolyakAverage", "UpdaterSequence"]
 class _NetworkUpdater(TargetNetUpdater):
     """An updater of the named networks of a loss only.
 
-    A subclass says in ``_step`` what one call does to one tensor. TorchRL's constructor takes every
-    target of the loss. Its ``init_`` and ``step`` keep a collection of the tensors that required a
-    gradient when it was built: buffers (the statistics of a normalisation layer), frozen layers and
-    parameters shared with another network would stay behind. Ours read the loss at each call.
+    A subclass says in ``_update`` what one call does to one tensor. TorchRL's constructor takes
+    every target of the loss. Its ``init_`` and ``step`` keep a collection of the tensors that
+    required a gradient when it was built: buffers (the statistics of a normalisation layer), frozen
+    layers and parameters shared with another network would stay behind. Ours read the loss at each
+    call.
     """
 
     option: str
@@ -90,7 +93,7 @@ class _NetworkUpdater(TargetNetUpdater):
         The constructor does this. Call it again after ``loss.reset_parameters_recursive()``, which
         draws different values for a network and for its delayed copy.
         """
-        for source, target in self._pairs():
+        for _, source, target in self._pairs():
             target.copy_(source)
         self.initialized = True
 
@@ -104,8 +107,12 @@ class _NetworkUpdater(TargetNetUpdater):
         if not self.initialized:
             raise RuntimeError(f"Call {type(self).__name__}.init_() before step().")
         if self._is_due():
-            for source, target in self._pairs():
-                self._step(source, target)
+            for name, source, target in self._pairs():
+                self._update(name, source, target)
+
+    def _update(self, name: str, source: Tensor, target: Tensor) -> None:
+        """What one call does to one delayed tensor: makes it equal to that of the network."""
+        target.copy_(source)
 
     def _is_due(self) -> bool:
         """Whether this call does anything."""
@@ -125,8 +132,8 @@ class _NetworkUpdater(TargetNetUpdater):
             )
         super().load_state_dict(state_dict)
 
-    def _pairs(self) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yields the data of every (network tensor, delayed tensor), buffers included."""
+    def _pairs(self) -> Iterator[tuple[str, Tensor, Tensor]]:
+        """Yields the name and the data of every network tensor and its copy, buffers included."""
         for network in self.networks:
             delayed = f"target_{network}_params"
             sources = getattr(self.loss_module, f"{network}_params")
@@ -137,7 +144,8 @@ class _NetworkUpdater(TargetNetUpdater):
                         "buffers. Use them through "
                         "`params.to_module(net, preserve_module_state=False)`."
                     )
-                yield sources.get(key).data, target.data
+                path = (network, *unravel_key((key,)))
+                yield ".".join(path), sources.get(key).data, target.data
 
     def __repr__(self) -> str:
         arguments = [type(self.loss_module).__name__, *map(repr, self.networks)]
@@ -173,8 +181,8 @@ class PeriodicCopy(_NetworkUpdater):
     option = "interval"
 
     def __init__(self, loss_module: LossModule, *networks: str, interval: int) -> None:
-        check_count("interval", interval, reason=", the number of calls from one copy to the next")
-        self.interval = interval
+        reason = ", the number of calls from one copy to the next"
+        self.interval = check_count("interval", interval, reason=reason)
         self.counter = 0
         super().__init__(loss_module, *networks)
 
@@ -191,16 +199,15 @@ class PeriodicCopy(_NetworkUpdater):
         self.counter = 0
         return True
 
-    def _step(self, p_source: Tensor, p_target: Tensor) -> None:
-        p_target.copy_(p_source)
-
 
 class PolyakAverage(_NetworkUpdater):
     """Moves delayed networks a fraction of the way towards the networks on every call.
 
     ``delayed <- (1 - weight) * delayed + weight * network``, in place, for parameters and floating
-    point buffers; integer and boolean buffers (a layer's batch counter) are copied. There is an
-    example at the head of :mod:`torchrl_ecpo.updaters`.
+    point buffers; integer and boolean buffers (a layer's batch counter) are copied. The average of
+    a network in half precision, where small steps would be rounded away, is kept in single
+    precision, as part of the state dict. There is an example at the head of
+    :mod:`torchrl_ecpo.updaters`.
 
     Args:
         loss_module: any loss with delayed networks.
@@ -220,16 +227,54 @@ class PolyakAverage(_NetworkUpdater):
     option = "weight"
 
     def __init__(self, loss_module: LossModule, *networks: str, weight: float = 0.005) -> None:
-        if not 0 < weight <= 1:
+        self.weight = as_float("weight", weight)
+        if not 0 < self.weight <= 1:
             raise ValueError(f"weight must be in (0, 1], got {weight!r}.")
-        self.weight = weight
+        self._averages: dict[str, Tensor] = {}
         super().__init__(loss_module, *networks)
 
-    def _step(self, p_source: Tensor, p_target: Tensor) -> None:
-        if p_target.is_floating_point():
-            p_target.lerp_(p_source, self.weight)
+    def init_(self) -> None:
+        """Copies the networks into their delayed parameters, now; averages begin there."""
+        super().init_()
+        self._averages.clear()
+
+    def _update(self, name: str, source: Tensor, target: Tensor) -> None:
+        if not target.is_floating_point():
+            target.copy_(source)
+        elif _is_half(target):
+            self._averages[name] = self._average(name, target).lerp(source.float(), self.weight)
+            target.copy_(self._averages[name])
         else:
-            p_target.copy_(p_source)
+            target.lerp_(source, self.weight)
+
+    def _average(self, name: str, target: Tensor) -> Tensor:
+        """In single precision; anew from the delayed tensor where somebody else has written it."""
+        average = self._averages.get(name)
+        if average is None:
+            return target.float()
+        average = average.to(target.device)
+        return average.where(average.to(target.dtype) == target, target.float())
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the progress: of networks in half precision, their averages in single."""
+        pairs = [(name, target) for name, _, target in self._pairs() if _is_half(target)]
+        averages = {name: self._average(name, target) for name, target in pairs}
+        return super().state_dict() | ({"averages": averages} if averages else {})
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restores what :meth:`state_dict` returned.
+
+        Raises:
+            ValueError: if it is not the state of an updater of this kind and of these networks.
+        """
+        own, given = self.state_dict().get("averages", {}), state_dict.get("averages", {})
+        super().load_state_dict(state_dict)
+        if {n: x.shape for n, x in own.items()} != {n: x.shape for n, x in given.items()}:
+            raise ValueError(
+                f"The averages in the state are of {sorted(given)}, not of this updater's "
+                f"{sorted(own)} or of other shapes: was it saved with other networks?"
+            )
+        self._averages = {name: average.clone() for name, average in given.items()}
 
 
 class UpdaterSequence(TargetNetUpdater):
@@ -302,6 +347,11 @@ class UpdaterSequence(TargetNetUpdater):
     def __repr__(self) -> str:
         lines = "".join(f"    {updater!r},\n" for updater in self.updaters)
         return f"{type(self).__name__}(\n{lines})"
+
+
+def _is_half(tensor: Tensor) -> bool:
+    """Whether it has floating point numbers of less than single precision."""
+    return tensor.is_floating_point() and tensor.dtype.itemsize < torch.float32.itemsize
 
 
 def _delayed_networks(loss_module: LossModule, networks: tuple[str, ...] = ()) -> tuple[str, ...]:

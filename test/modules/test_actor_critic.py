@@ -265,12 +265,23 @@ def test_torchrl_s_sac_trains_them(deactivate_vmap):
         assert next(actor.parameters()).grad is not None
 
 
+@pytest.mark.parametrize("make", [make_qvalue_network, lambda n, m: make_value_network(n)])
+@pytest.mark.parametrize("size", [0, 2.0, True, "3", None])
+def test_sizes_that_are_none_are_refused(make, size):
+    with pytest.raises(ValueError, match="must be an integer of at least 1, got"):
+        make(size, 0)
+
+
 @pytest.mark.parametrize("make", ACTORS)
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
         (OneHot(4), "got OneHot. Discrete actions belong to DiscreteECACLoss"),
         (Bounded(-1.0, 1.0, shape=(5, 2)), r"one vector, got the shape \(5, 2\)"),
+        (Bounded(0.0, torch.inf, shape=(2,)), r"finite bounds.*got \[0.0, 0.0\] to \[inf, inf\]"),
+        (Bounded(-torch.inf, 1.0, shape=(1,)), r"finite bounds.*got \[-inf\] to \[1.0\]"),
+        (Bounded(-3e38, 3e38, shape=(1,)), "finite bounds.*at a finite distance, got"),
+        (Bounded(1.0, 1.0, shape=(1,)), r"the upper one above.*got \[1.0\] to \[1.0\]"),
     ],
 )
 def test_other_actions_are_refused(make, spec, message):

@@ -31,7 +31,7 @@ from torchrl_ecpo import (
 
 ACTION, CHOICES, GAMMA = 2, 4, 0.9
 FIXED = {"target_kl": None, "target_entropy": None}
-LEARNED = {"target_kl": 0.05, "target_entropy": -1.5}
+LEARNED = {"target_kl": 0.05, "target_entropy": 0.6}
 
 # ------------------------------------------------------------------------------------ the networks
 

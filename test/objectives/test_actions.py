@@ -11,6 +11,7 @@ from torch.distributions import (
     Bernoulli,
     Beta,
     Categorical,
+    ExpTransform,
     Independent,
     IndependentTransform,
     MultivariateNormal,
@@ -92,6 +93,23 @@ def test_saturated_actions_are_never_inverted(kind, dtype):
     expected = normal - (math.log(4) - 2 * actions.latent) - stretch
     assert_close(actions.log_prob, expected.sum(-1), rtol=1e-4, atol=1e-3)
     assert actions.log_prob.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("policy", "width"),
+    [
+        (GAUSSIAN["normal"](LOC, SCALE), math.inf),
+        *((GAUSSIAN[kind](LOC, SCALE), 5) for kind in ("bounded", "torch_bounded", "joint_tanh")),
+        (TanhNormal(LOC, SCALE), 2),
+        (TruncatedNormal(LOC, SCALE, low=-0.5, high=0.5), 1),
+        (TransformedDistribution(Independent(Normal(LOC, SCALE), 1), [ExpTransform()]), math.inf),
+    ],
+    ids=lambda x: type(x).__name__,
+)
+def test_no_policy_has_more_entropy_than_the_volume_allows(policy, width):
+    low, high = SampledActions.of(policy, 5).entropy_range(policy)
+    assert low == -math.inf
+    assert_close(high, torch.full((3,), 2 * math.log(width), dtype=torch.float64))
 
 
 OTHERS = {

@@ -47,6 +47,7 @@ from torchrl.modules import (
     MaskedCategorical,
     MaskedOneHotCategorical,
     ProbabilisticActor,
+    TanhNormal,
     ValueOperator,
     set_recurrent_mode,
 )
@@ -892,7 +893,7 @@ def test_n_step_returns():
     assert_close(loss.soft_bellman_target(stored), expected, rtol=1e-5, atol=1e-6)
 
 
-@losses
+@every_loss
 def test_nothing_is_expected_after_a_terminated_state(case):
     """Whatever stands there; after a time limit the value counts."""
     loss, batch = case.build(), _batch(case)
@@ -919,8 +920,23 @@ def test_skip_done_states(case):
     others = [0, 1, 3, 4, 5]
     assert_close(actual["loss_qvalue"][others], expected["loss_qvalue"][others])
     assert actual["loss_qvalue"].isfinite().all()
-    with pytest.raises(ValueError, match="target of the soft Q value is NaN or infinite in 1 of 6"):
+    name = r"entry \('next', 'observation'\) is NaN or infinite"
+    with pytest.raises(ValueError, match=name):
         case.build()(batch)
+
+
+def test_the_lift_of_the_next_state_is_given_what_the_networks_read(monkeypatch):
+    """And nothing else of what stands there."""
+    loss, given = CASE.build(), []
+    lift = loss.lift
+
+    def watched(observations, *args):
+        given.append([*observations.keys()])
+        return lift(observations, *args)
+
+    monkeypatch.setattr(loss, "lift", watched)
+    loss.soft_bellman_target(_batch())
+    assert given == [["observation"]]
 
 
 def test_skipped_states_keep_their_dtype():
@@ -1021,7 +1037,7 @@ def test_loss_of_a_learned_tau(case, reduction):
 def test_loss_of_a_learned_tau_prime(case):
     """-log tau' (target entropy - entropy): SAC's, up where entropy is short; its auto too."""
     entropy = call(case.build(), _batch(case))["entropy"].item()
-    for excess in (0.3, -0.4):
+    for excess in (0.2, -0.4):
         loss = case.build(target_entropy=entropy + excess)
         value = call(loss, _batch(case))["loss_tau_prime"]
         assert_close(value.item(), -math.log(case.tau_prime) * excess)
@@ -1033,7 +1049,7 @@ def test_loss_of_a_learned_tau_prime(case):
 
 @pytest.mark.parametrize(
     ("name", "option", "far_above", "far_below"),
-    [("tau", "target_kl", 1e-9, 0.3), ("tau_prime", "target_entropy", 9.0, -9.0)],
+    [("tau", "target_kl", 1e-9, 0.3), ("tau_prime", "target_entropy", 1.38, -9.0)],
 )
 def test_learned_temperatures_stop_at_their_floor(name, option, far_above, far_below):
     """However far below the parameter may be: it is sent up from there, and down no further."""
@@ -1091,6 +1107,10 @@ def test_learned_temperatures_settle_where_the_constraints_hold(case):
         ("pmd_ac", {"num_action_samples": None}, "num_action_samples must be an integer.*None"),
         ("ecac", {"num_next_action_samples": 2.5}, "num_next_action_samples must be an integer"),
         ("ecac", {"use_prioritized_weights": "yes"}, "use_prioritized_weights must be.*got 'yes'"),
+        ("ecac", {"use_prioritized_weights": 1}, "must be one of True, False, 'auto', got 1"),
+        ("ecac", {"delay_actor": "no"}, "delay_actor must be one of True, False, got 'no'"),
+        ("ecac", {"delay_qvalue": 0}, "delay_qvalue must be one of True, False, None, got 0"),
+        ("ecac", {"skip_done_states": "no"}, "skip_done_states must be one of True, False, got"),
         ("ecac", {"num_actor_states": 3, "reduction": "none"}, "num_actor_states must be None.*3"),
         ("ecac", {"value": True, "delay_qvalue": True}, "With a value_network.*None.*True"),
         ("ecac", {"target_kl": "a"}, "target_kl must be a number, got 'a'"),
@@ -1135,7 +1155,7 @@ def test_policies_of_another_kind(case):
     for networks.actor, message in (
         (other, f"For a policy over {own}.* qvalue_network must {says}"),
         (coins, "got Bernoulli|For a policy over"),
-        (make_actor("composite"), "takes one action, got Composite"),
+        (make_actor("composite"), "got CompositeDistribution.*hybrid ones are for the losses of g"),
     ):
         with pytest.raises(ValueError, match=message):
             case.build(networks)(_batch(case))
@@ -1144,30 +1164,123 @@ def test_policies_of_another_kind(case):
 @pytest.mark.parametrize(
     ("key", "entry", "message"),
     [
-        (("next", "reward"), torch.ones(6), r"have the shape \[\*B, 1\], got \(6,\)"),
-        (("next", "reward"), torch.ones(6, 1).cfloat(), "hold real numbers, got torch.complex64"),
+        (("next", "reward"), torch.ones(6), r"must be real .* \[\*B, 1\].*got .*\(6,\)"),
+        (("next", "reward"), torch.ones(6, 1) * 1j, "must be real .*got torch.complex64"),
+        (("next", "reward"), torch.ones(0, 1), r"of one transition at least, got .*\(0, 1\)"),
         (("next", "done"), torch.zeros(6).bool(), r"have the shape \(6, 1\) of the reward"),
-        (("next", "terminated"), torch.zeros(6).bool(), r"have the shape \(6, 1\) of the reward"),
+        (("next", "terminated"), torch.zeros(6, 1), "must be boolean .* got torch.float32"),
+        (("next", "terminated"), torch.zeros(6, 1).long(), "must be boolean .* got torch.int64"),
         (MASK, torch.ones(5).bool(), r"have the shape \(6,\).*got \(5,\)"),
+        (("next", "observation"), torch.ones(5, OBSERVATION), r"must begin with .*\[6\].*got \[5"),
+        (
+            "observation",
+            torch.ones(6, OBSERVATION + 1).double(),
+            r"evaluated on.*'observation' .*\(6",
+        ),
+        ("observation", torch.ones(6, OBSERVATION), r"evaluated on.*'observation' .*float32"),
+        ("action", torch.ones(6, ACTION + 1).double(), r"cannot be evaluated on 'action' \[6, 3\]"),
+        ("action", torch.full((6, ACTION), math.nan).double(), "is NaN or infinite in 12 of 12"),
+        ("priority_weight", torch.tensor([1.0, -2, 1, 1, 1, 1]), "at least 0, got -2 .* 1 of 6"),
+        ("priority_weight", torch.full((6, 1), math.nan), "finite and at least 0, got nan"),
+        ("priority_weight", torch.full((6,), math.inf), "finite and at least 0, got inf"),
+        ("priority_weight", torch.ones(6, 2), r"must have the shape \[6\].*got \[6, 2\]"),
     ],
     ids=str,
 )
 def test_entries_of_the_wrong_kind(key, entry, message):
-    """Named, before anything broadcasts."""
+    """Named, before anything broadcasts; nothing is written."""
     batch = TensorDict(_batch().to_dict()).set(key, entry)
-    with pytest.raises(ValueError, match=rf"'{key[1]}'\) must {message}"):
+    with pytest.raises(ValueError, match=message) as info:
         CASE.build()(batch)
+    assert repr(key) in str(info.value)
+    assert batch.get("td_error", None) is None
+
+
+@pytest.mark.parametrize("scale", [1e30, 1e19], ids=["of each", "in sum"])
+def test_losses_that_overflow(scale):
+    batch = _batch(dtype=torch.float32)
+    batch["next", "reward"] = torch.full((6, 1), scale)
+    loss = CASE.build(make_networks(dtype=torch.float32))
+    with pytest.raises(ValueError, match=r"loss_qvalue, computed from \('next', 'reward'\)"):
+        loss(batch)
+
+
+def test_parameters_that_are_not_finite_are_named():
+    loss = CASE.build()
+    loss.actor_network_params["module", "0", "module", "0", "bias"].data.fill_(math.nan)
+    with pytest.raises(ValueError, match=r"actor_network_params.*bias is NaN or infinite in 4"):
+        loss(_batch())
 
 
 @pytest.mark.parametrize(
-    "action",
-    [torch.zeros(6, CHOICES + 1), torch.zeros(6, 2).long(), torch.rand(6), torch.zeros(6, 6, 1)],
-    ids=lambda action: str(tuple(action.shape)),
+    ("action", "message"),
+    [
+        (torch.zeros(6, CHOICES + 1), "one-hot of shape"),
+        (torch.zeros(6, 2).long(), "one-hot of shape"),
+        (torch.rand(6), "one-hot of shape"),
+        (torch.zeros(6, 6, 1), "one-hot of shape"),
+        (torch.tensor([0, 1, 2, 3, 4, 7]), "0 to 3, or one-hot.*; 2 of 6 are not"),
+        (torch.tensor([0, 1, 2, 3, 0, -1]), "0 to 3, or one-hot.*; 1 of 6 are not"),
+        (torch.zeros(6, CHOICES), "single 1; 6 of 6 are not"),
+        (torch.tensor([0, 1, 1, 0]).expand(6, CHOICES), "single 1; 6 of 6 are not"),
+        (torch.tensor([1, -1, 0, 1]).expand(6, CHOICES), "single 1; 6 of 6 are not"),
+        (torch.tensor([1, 0.5, 0, 0]).expand(6, CHOICES), "single 1; 6 of 6 are not"),
+    ],
+    ids=lambda x: str(tuple(x.shape)) if isinstance(x, torch.Tensor) else "",
 )
-def test_wrong_shape_of_a_discrete_action(action):
+def test_wrong_discrete_actions(action, message):
     case = CASES["discrete_ecac"]
-    with pytest.raises(ValueError, match=r"must be one-hot of shape \(6, 4\) or an integer"):
+    with pytest.raises(ValueError, match=f"The action 'action' must be.*{message}"):
         case.build()(_batch(case).set("action", action))
+
+
+@pytest.mark.parametrize(
+    ("name", "allowed", "target"),
+    [
+        ("discrete_ecac", CHOICES, 1.4),
+        ("discrete_ecac", CHOICES, 0.0),
+        ("discrete_pmd_ac", CHOICES, -1.0),
+        ("discrete_ecac", 2, 0.7),
+        ("ecac", CHOICES, 1.4),
+        ("tiny", CHOICES, "auto"),
+    ],
+)
+def test_entropies_that_no_policy_has(name, allowed, target):
+    """Above log n of what a mask leaves, not above 0, above the log-volume of the bounds."""
+    loss, batch = _masked(name, allowed, target_entropy=target)
+    with pytest.raises(ValueError, match=f"target_entropy={target!r} asks for .* nats, which no"):
+        loss(batch)
+
+
+@pytest.mark.parametrize("allowed", [2, CHOICES])
+def test_auto_follows_the_mask(allowed):
+    loss, batch = _masked("discrete_ecac", allowed, target_entropy="auto")
+    outputs = loss(batch)
+    excess = 0.98 * math.log(allowed) - outputs["entropy"]
+    assert_close(outputs["loss_tau_prime"], -loss.log_tau_prime * excess)
+
+
+def _masked(name, allowed, **options):
+    """A loss with a mask that leaves the first actions, or with actions in a tiny box."""
+    networks, batch = make_networks(), _batch(CASES.get(name, CASE))
+    if name == "tiny":
+        bounds = {"low": -0.05, "high": 0.05}
+        networks.actor = ProbabilisticActor(
+            networks.actor[0],  # type: ignore
+            ["loc", "scale"],
+            distribution_class=TanhNormal,
+            distribution_kwargs=bounds,
+        )
+    elif name != "ecac":
+        networks = make_networks("categorical")
+        networks.actor = ProbabilisticActor(
+            networks.actor[0],  # type: ignore
+            {"logits": "logits", "mask": "action_mask"},
+            distribution_class=MaskedCategorical,
+        )
+        for where in (batch, batch["next"]):
+            where["action_mask"] = (torch.arange(CHOICES) < allowed).expand(6, CHOICES)
+    return CASES.get(name, CASE).build(networks, **options), batch
 
 
 @pytest.mark.parametrize(
@@ -1224,9 +1337,9 @@ def test_lists_of_q_networks(copies, number):
 @pytest.mark.parametrize(
     ("key", "message"),
     [
-        (("next", "reward"), r"The reward \('next', 'reward'\) is NaN or infinite in 1 of 6"),
-        (("next", "observation"), "The target of the soft Q value is NaN or infinite in 1 of 6"),
-        (("observation",), "(soft Q value|policy) is NaN or infinite"),
+        (("next", "reward"), r"entry \('next', 'reward'\) is NaN or infinite in 1 of 6"),
+        (("next", "observation"), r"entry \('next', 'observation'\) is NaN or infinite in 3 of"),
+        (("observation",), "entry 'observation' is NaN or infinite"),
     ],
     ids=str,
 )

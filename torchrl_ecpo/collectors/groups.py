@@ -16,6 +16,7 @@ from torch import nn
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
+from torchrl_ecpo.checks import check_count, check_flag, check_group_size
 from torchrl_ecpo.collectors._base import PlayerCollector
 from torchrl_ecpo.collectors.rollout import GroupPlayer
 from torchrl_ecpo.collectors.workers import Workers
@@ -141,11 +142,11 @@ class TrajectoryGroupCollector(PlayerCollector):
         """Make the collector; the class describes the arguments."""
         for name in options.keys() & _REFUSED.keys():
             raise TypeError(f"TrajectoryGroupCollector does not take {name}: {_REFUSED[name]}.")
-        if group_size < 2 or num_groups < 1:
-            raise ValueError(
-                "Collecting groups needs num_groups of at least 1 and group_size of at least 2, "
-                f"got num_groups={num_groups}, group_size={group_size}."
-            )
+        num_groups = check_count("num_groups", num_groups)
+        group_size = check_group_size(group_size)
+        check_flag("sync", sync, None)
+        if num_collectors is not None:
+            check_count("num_collectors", num_collectors)
         backend, makers = _find_makers(create_env_fn, backend, num_collectors, sync)
         if backend_options is not None and backend != "ray":
             raise ValueError(f"backend_options are for backend='ray', got them for {backend!r}.")

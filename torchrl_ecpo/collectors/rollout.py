@@ -27,6 +27,7 @@ from torchrl.modules import (
     set_exploration_modules_spec_from_env,
 )
 
+from torchrl_ecpo.checks import check_count, check_flag
 from torchrl_ecpo.collectors.workers import set_training
 from torchrl_ecpo.groups import GROUP_KEY, MASK_KEY, TRAJECTORY_KEY
 from torchrl_ecpo.modules import record_latents
@@ -59,13 +60,16 @@ class GroupPlayer:
     ) -> None:
         """Make the environment, and the policy if a factory is given."""
         self.num_groups, self.group_size, self.group_key = num_groups, group_size, group_key
-        self.compact_obs, self.exclude_keys = compact_obs, set(map(unravel_key, exclude_keys))
-        self.max_steps, self.exploration_type = max_steps, exploration_type
+        self.compact_obs = check_flag("compact_obs", compact_obs)
+        self.exclude_keys = set(map(unravel_key, exclude_keys))
+        self.max_steps = check_count("max_steps", max_steps)
+        self.exploration_type = exploration_type
         self.policy_device, self.storing_device = policy_device, storing_device
         env = create_env_fn if isinstance(create_env_fn, EnvBase) else create_env_fn()
         env = env if env_device is None else env.to(env_device)
         if max_frames_per_traj:
-            env = TransformedEnv(env, StepCounter(max_frames_per_traj), auto_unwrap=False)
+            frames = check_count("max_frames_per_traj", max_frames_per_traj)
+            env = TransformedEnv(env, StepCounter(frames), auto_unwrap=False)
         self._check_env(env)
         if policy_factory is not None:
             if policy is not None:

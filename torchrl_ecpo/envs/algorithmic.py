@@ -400,7 +400,9 @@ class AlgorithmicEnv(EnvBase):
         check_count("num_groups", num_groups)
         check_count("group_size", group_size)
         lowest = self.task.duplication
-        if min_length is not None and not lowest <= min_length <= _TOP_LEVEL:
+        if min_length is not None and not (
+            lowest <= check_count("min_length", min_length, least=0) <= _TOP_LEVEL
+        ):
             raise ValueError(
                 f"min_length of {self.task_name} must lie in {lowest}..{_TOP_LEVEL}, "
                 f"got {min_length}."

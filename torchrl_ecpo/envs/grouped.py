@@ -14,7 +14,7 @@ from torchrl.data import Unbounded
 from torchrl.data.utils import CloudpickleWrapper
 from torchrl.envs import EnvBase, GymWrapper, ParallelEnv, SerialEnv, TransformedEnv
 
-from torchrl_ecpo.checks import check_count, check_group_size
+from torchrl_ecpo.checks import check_count, check_flag, check_group_size
 from torchrl_ecpo.envs._groups import GroupIdAllocator
 from torchrl_ecpo.groups import GROUP_KEY
 
@@ -74,9 +74,9 @@ class GroupedEnv(EnvBase):
         parallel: bool = False,
     ) -> None:
         """Make the environment; the class describes the arguments."""
-        check_count("num_groups", num_groups)
-        check_group_size(group_size)
-        batched = ParallelEnv if parallel else SerialEnv
+        num_groups = check_count("num_groups", num_groups)
+        group_size = check_group_size(group_size)
+        batched = ParallelEnv if check_flag("parallel", parallel) else SerialEnv
         copies = batched(
             num_groups * group_size, CloudpickleWrapper(partial(_make_copy, create_env_fn))
         )

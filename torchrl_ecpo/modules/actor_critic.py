@@ -25,6 +25,7 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.modules import ProbabilisticActor, TanhModule, TanhNormal
 
 from torchrl_ecpo._torch import is_transformed
+from torchrl_ecpo.checks import as_float, check_count
 
 __all__ = [
     "DenseNetwork",
@@ -58,7 +59,8 @@ class DenseNetwork(TensorDictModuleBase):
         final_gain: factor of the last layer's parameters at the start. Default: 1.
 
     Raises:
-        ValueError: if ``final_gain`` is negative or not finite.
+        ValueError: if a size is no integer of at least 1, or if ``final_gain`` is negative or not
+            finite.
 
     Examples:
         >>> import torch
@@ -77,10 +79,10 @@ class DenseNetwork(TensorDictModuleBase):
         final_gain: float = 1.0,
     ) -> None:
         super().__init__()
-        if not 0 <= final_gain < math.inf:
+        if not 0 <= as_float("final_gain", final_gain) < math.inf:
             raise ValueError(f"final_gain must be at least 0 and finite, got {final_gain}.")
         self.in_keys, self.out_keys = list(in_keys), list(out_keys)
-        self.sizes = tuple(sizes)
+        self.sizes = tuple(check_count("The size of a layer", size) for size in sizes)
         self.head = head
         self.final_gain = final_gain
         self._names = [name for i in range(len(sizes) - 1) for name in (f"weight_{i}", f"bias_{i}")]
@@ -210,8 +212,8 @@ def make_tanh_gaussian_actor(
             Reinforcement Learning?", Andrychowicz et al., 2021.
 
     Raises:
-        ValueError: if the actions are not vectors of bounded numbers, or if ``final_gain`` is
-            negative or not finite.
+        ValueError: if the actions are not vectors of numbers within finite bounds, or if
+            ``final_gain`` is negative or not finite.
 
     Examples:
         >>> import torch
@@ -253,7 +255,7 @@ def make_deterministic_actor(
         hidden_sizes: units of each hidden layer. Default: (256, 256).
 
     Raises:
-        ValueError: if the actions are not vectors of bounded numbers.
+        ValueError: if the actions are not vectors of numbers within finite bounds.
 
     Examples:
         >>> import torch
@@ -286,7 +288,9 @@ def make_qvalue_network(
         >>> qvalue(observation=torch.zeros(5, 3), action=torch.zeros(5, 2)).shape
         torch.Size([5, 1])
     """
-    sizes = [observation_size + action_size, *hidden_sizes, 1]
+    inputs = check_count("observation_size", observation_size)
+    inputs += check_count("action_size", action_size)
+    sizes = [inputs, *hidden_sizes, 1]
     return DenseNetwork(["observation", "action"], ["state_action_value"], sizes)
 
 
@@ -312,11 +316,21 @@ def _bounded(action_spec: TensorSpec) -> Any:
     if not isinstance(action_spec, Bounded) or not action_spec.dtype.is_floating_point:
         raise ValueError(
             "action_spec must be of bounded continuous actions (torchrl's Bounded), got "
-            f"{type(action_spec).__name__}. Discrete actions belong to DiscreteECACLoss."
+            f"{type(action_spec).__name__}. Discrete actions belong to DiscreteECACLoss, "
+            "several or hybrid ones to the losses of groups, such as ECPOLoss."
         )
     if len(action_spec.shape) != 1:
         raise ValueError(
             f"action_spec must be of one vector, got the shape {tuple(action_spec.shape)}: take "
             "`env.action_spec_unbatched`."
+        )
+    space: Any = action_spec.space
+    low, high = space.low, space.high
+    if not (
+        (high > low) & (high - low < math.inf)
+    ).all():  # wider than the largest number is infinite
+        raise ValueError(
+            "action_spec must have finite bounds, the upper one above, at a finite distance, got "
+            f"{low.tolist()} to {high.tolist()}. Bound the actions in the environment."
         )
     return action_spec

@@ -16,6 +16,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import TensorDictPrimer
 from torchrl.modules import recurrent_mode
 
+from torchrl_ecpo.checks import check_count
 from torchrl_ecpo.modules.histories import (
     Histories,
     LSTMOverHistories,
@@ -98,11 +99,11 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
         dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
-        self.num_classes = tuple(num_classes)
-        self.num_symbols = prod(num_classes)
-        if min(num_classes) < 1 or self.num_symbols > 2**31:
+        self.num_classes = tuple(check_count("A number of num_classes", n) for n in num_classes)
+        self.num_symbols = prod(self.num_classes)
+        if self.num_symbols > 2**31:
             raise ValueError(
-                "num_classes: expected positive numbers with a product of at most 2^31, got "
+                "num_classes: expected numbers with a product of at most 2^31, got "
                 f"{self.num_classes}."
             )
         self.input_keys = list(in_keys)
@@ -110,8 +111,8 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
         self.in_keys = all_keys
         out_keys: list[Any] = [out_key, *(("next", key) for key in STATE_KEYS)]
         self.out_keys = out_keys
-        self.hidden_size = hidden_size
-        self.cell = nn.LSTMCell(sum(num_classes), hidden_size, device=device, dtype=dtype)
+        self.hidden_size = check_count("hidden_size", hidden_size)
+        self.cell = nn.LSTMCell(sum(self.num_classes), self.hidden_size, device=device, dtype=dtype)
         self.readout = readout if readout is not None else nn.Identity()
 
     def make_tensordict_primer(self) -> TensorDictPrimer:

@@ -15,6 +15,7 @@ from torch.nn import functional as F
 from torchrl.envs import ExplorationType, exploration_type
 from torchrl.modules import LSTMModule, ProbabilisticActor
 
+from torchrl_ecpo.checks import check_count, check_flag
 from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
 
 __all__ = ["TupleCategorical", "make_tuple_policy"]
@@ -247,12 +248,14 @@ def make_tuple_policy(
         ...     actor.get_dist(data).entropy().shape
         torch.Size([4, 10])
     """
+    num_observations = check_count("num_observations", num_observations)
+    hidden_size = check_count("hidden_size", hidden_size)
     num_classes = [num_observations, *(n + 1 for n in nvec)]
     inputs: list[NestedKey] = ["observation", "previous_action"]
     factory: dict[str, Any] = {"device": device, "dtype": dtype}
     core: Any
     readout = nn.Linear(hidden_size, _num_logits(nvec), **factory)
-    if distinct_histories:
+    if check_flag("distinct_histories", distinct_histories):
         core = DistinctHistoryLSTM(
             num_classes,
             hidden_size,

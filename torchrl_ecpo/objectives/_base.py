@@ -16,7 +16,14 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
 
-from torchrl_ecpo.checks import as_float, check_choice, check_mask, present, values_can_be_seen
+from torchrl_ecpo.checks import (
+    as_float,
+    check_choice,
+    check_flag,
+    check_mask,
+    present,
+    values_can_be_seen,
+)
 from torchrl_ecpo.functional import check_temperatures, temperature_dual
 
 REDUCTIONS = ("none", "mean", "sum")
@@ -66,7 +73,7 @@ class PolicyLoss(LossModule):
             )
         self.reduction = "mean" if reduction is None else reduction
         check_choice("reduction", self.reduction, REDUCTIONS)
-        self.delay_actor = delay_actor
+        self.delay_actor = check_flag("delay_actor", delay_actor)
         self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
         self._allow_zero = allow_zero
         for name, value in self._as_temperatures(temperatures or {}).items():
@@ -99,11 +106,18 @@ class PolicyLoss(LossModule):
         if name not in buffers:
             super().__setattr__(name, value)
             return
-        current = {other: buffers[other] for other in names if other in buffers}
+        buffers[name].fill_(self.allowed_temperatures(**{name: value})[name])
+
+    def allowed_temperatures(self, **values: Any) -> dict[str, float]:
+        """Numbers, by name; refuse those that are not allowed beside the other temperatures.
+
+        None is a value that is not known, but positive.
+        """
+        buffers = dict(self.named_buffers(recurse=False))
+        current = {name: buffers[name] for name in self.temperature_names if name in buffers}
+        known = {name: value for name, value in {**current, **values}.items() if value is not None}
         # A temperature that is no buffer is learned, and positive.
-        has_learned = len(current) < len(names)
-        allowed = self._as_temperatures({**current, name: value}, allow_zero=has_learned)
-        buffers[name].fill_(allowed[name])
+        return self._as_temperatures(known, allow_zero=len(known) < len(self.temperature_names))
 
     def learn(self, name: str, start: float, *, floor: float = 1e-6, instead: str = "") -> None:
         """Learn a temperature, or the multiplier of a constraint, in log-space.

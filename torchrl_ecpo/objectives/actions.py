@@ -53,14 +53,23 @@ def actions_of(distribution: Distribution, num_samples: int) -> Actions:
     Raises:
         ValueError: for a policy with neither.
     """
+    check_policy(distribution)
     if is_discrete(distribution):
         return AllActions.of(distribution)
-    if distribution.has_rsample:
-        return SampledActions.of(distribution, num_samples)
-    raise ValueError(
-        "The policy must be over one of n actions (Categorical, OneHotCategorical) or over actions "
-        f"with rsample (TanhNormal), got {type(distribution).__name__}."
-    )
+    return SampledActions.of(distribution, num_samples)
+
+
+def check_policy(distribution: type | Distribution) -> None:
+    """Refuse distributions, or classes of them, that no actor-critic loss takes."""
+    kind = distribution if isinstance(distribution, type) else type(distribution)
+    # A class does not know whether what it wraps has rsample: a property is true.
+    if not is_discrete(kind) and not distribution.has_rsample:  # pyright: ignore
+        raise ValueError(
+            "The policy of an actor-critic loss must be over one of n actions (Categorical, "
+            "OneHotCategorical) or over one vector with rsample (TanhNormal), got "
+            f"{kind.__name__}. Several discrete actions and hybrid ones are for the losses of "
+            "groups, such as ECPOLoss."
+        )
 
 
 class SampledActions(NamedTuple):
@@ -112,6 +121,17 @@ class SampledActions(NamedTuple):
         """What is meant by ``"auto"``: -A nats, SAC's."""
         return -float(self.action.shape[-1]) if isinstance(target, str) else target
 
+    def entropy_range(self, distribution: Distribution) -> tuple[float, Tensor]:
+        """Minus infinity, and the log-volume ``[*B]`` of where actions may lie, if it is known."""
+        base, transforms = split(distribution)
+        low, high = -math.inf, math.inf
+        ends = [getattr(base, name, end) for name, end in (("low", low), ("high", high))]
+        ends = [torch.zeros_like(self.latent[0]) + end for end in ends]
+        for transform in transforms:
+            ends = [transform(end) for end in ends]
+        log_volume = (ends[1] - ends[0]).abs().log().sum(-1)
+        return low, log_volume.nan_to_num(high, high, low)
+
     def divergence_bound(self, target_kl: float) -> float:
         """In nats, from that per action dimension; which M samples must be able to show."""
         bound, num_samples = self.action.shape[-1] * target_kl, len(self.action)
@@ -162,9 +182,23 @@ class AllActions(NamedTuple):
         """KL(target, policy) ``[*B]`` in nats; from normalised weights ``[n, *B]``."""
         return (weights * (log_weights.log_softmax(0) - self.log_prob)).sum(0)
 
-    def entropy_target(self, target: float | str) -> float:
-        """What is meant by ``"auto"``: 0.98 log n nats, that of TorchRL's ``DiscreteSACLoss``."""
-        return 0.98 * math.log(len(self.log_prob)) if isinstance(target, str) else target
+    def entropy_target(self, target: float | str) -> Tensor | float:
+        """What is meant by ``"auto"``: 0.98 log n nats, that of TorchRL's ``DiscreteSACLoss``.
+
+        n ``[*B]`` is the number of actions that a mask leaves.
+        """
+        if not isinstance(target, str):
+            return target
+        return 0.98 * self._log_share() + 0.98 * math.log(len(self.log_prob))
+
+    def entropy_range(self, distribution: Distribution) -> tuple[float, Tensor]:
+        """0, and log n ``[*B]`` of the n actions that a mask leaves."""
+        return 0.0, self._log_share() + math.log(len(self.log_prob))
+
+    def _log_share(self) -> Tensor:
+        """Logarithm ``[*B]`` of the share of the actions that may be taken."""
+        number = (self.log_prob > _impossible(self.log_prob)).sum(0).clamp_min(1)
+        return (number / len(self.log_prob)).to(self.log_prob.dtype).log()
 
     def divergence_bound(self, target_kl: float) -> float:
         """In nats, as it is given."""

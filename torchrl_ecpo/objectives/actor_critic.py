@@ -11,7 +11,6 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import torch
 from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import (
-    CompositeDistribution,
     ProbabilisticTensorDictSequential,
     TensorDictModule,
     dispatch,
@@ -26,11 +25,14 @@ from torchrl.objectives.value import TD0Estimator, TD1Estimator, TDLambdaEstimat
 from torchrl.objectives.value.advantages import ValueEstimatorBase
 
 from torchrl_ecpo.checks import (
+    UNREADABLE,
     as_float,
     check_choice,
     check_count,
-    check_real,
+    check_flag,
     get_entry,
+    unreadable,
+    values_can_be_seen,
 )
 from torchrl_ecpo.functional import (
     Surrogate,
@@ -43,6 +45,7 @@ from torchrl_ecpo.objectives.actions import (
     AllActions,
     SampledActions,
     actions_of,
+    check_policy,
     is_discrete,
 )
 
@@ -176,41 +179,39 @@ class ActorCriticLoss(PolicyLoss):
             temperatures={"tau": tau, "tau_prime": tau_prime},
         )
         check_choice("loss_function", loss_function, LOSS_FUNCTIONS)
-        check_count("num_qvalue_nets", num_qvalue_nets)
-        check_count("num_action_samples", num_action_samples)
-        check_count("num_next_action_samples", num_next_action_samples)
+        self.num_qvalue_nets = check_count("num_qvalue_nets", num_qvalue_nets)
+        self.num_action_samples = check_count("num_action_samples", num_action_samples)
+        samples = check_count("num_next_action_samples", num_next_action_samples)
+        self.num_next_action_samples = samples
         if num_actor_states is not None:
-            check_count("num_actor_states", num_actor_states)
+            num_actor_states = check_count("num_actor_states", num_actor_states)
             if self.reduction == "none":
                 raise ValueError(
                     "num_actor_states must be None with reduction='none', where each state has its "
                     f"number; got {num_actor_states}."
                 )
-        if use_prioritized_weights not in (True, False, "auto"):
-            raise ValueError(
-                "use_prioritized_weights must be True, False or 'auto', got "
-                f"{use_prioritized_weights!r}."
-            )
+        check_flag("delay_qvalue", delay_qvalue, None)
         if value_network is not None and delay_qvalue:
             raise ValueError(
                 "With a value_network the value of the next state comes from its delayed copy: "
                 f"leave delay_qvalue=None, got {delay_qvalue}."
             )
-        self.min_tau, self.min_tau_prime = min_tau, min_tau_prime
-        self.num_qvalue_nets, self.num_actor_states = num_qvalue_nets, num_actor_states
-        self.num_action_samples = num_action_samples
-        self.num_next_action_samples = num_next_action_samples
+        self.min_tau = as_float("min_tau", min_tau)
+        self.min_tau_prime = as_float("min_tau_prime", min_tau_prime)
+        self.num_actor_states = num_actor_states
         self.loss_function = loss_function
-        self.skip_done_states = skip_done_states
-        self.use_prioritized_weights = use_prioritized_weights
+        self.skip_done_states = check_flag("skip_done_states", skip_done_states)
+        self.use_prioritized_weights = check_flag(
+            "use_prioritized_weights", use_prioritized_weights, "auto"
+        )
         self.delay_qvalue = value_network is None if delay_qvalue is None else delay_qvalue
         self._add_critics(qvalue_network, num_qvalue_nets, value_network)
         self._set_constraints(target_kl, target_entropy)
         if target_kl is not None:
-            self.learn("tau", float(tau), floor=min_tau, instead="target_kl")
+            self.learn("tau", float(tau), floor=self.min_tau, instead="target_kl")
         if target_entropy is not None:
-            instead = "target_entropy"
-            self.learn("tau_prime", float(tau_prime), floor=min_tau_prime, instead=instead)
+            floor, instead = self.min_tau_prime, "target_entropy"
+            self.learn("tau_prime", float(tau_prime), floor=floor, instead=instead)
         self.make_value_estimator(device=self._device)
         action_keys = getattr(actor_network, "dist_sample_keys", None)
         if action_keys:
@@ -258,6 +259,7 @@ class ActorCriticLoss(PolicyLoss):
             if not 0 < target_kl < math.inf:
                 raise ValueError(f"target_kl must be above 0, in nats, or None, got {target_kl}.")
         self.target_kl, self.target_entropy = target_kl, target_entropy
+        self._reachable: float | str | None = None  # the last target_entropy that was looked at
 
     # ------------------------------------------------------------------------------- one method
 
@@ -275,8 +277,8 @@ class ActorCriticLoss(PolicyLoss):
         """Compute all losses of a batch of transitions ``[*B]``.
 
         Args:
-            tensordict: with the entries of :attr:`in_keys`; the priority is written into it. (One
-                that is locked, as memory-mapped and shared ones are, takes it where it has it.)
+            tensordict: with the entries of :attr:`in_keys`; the priority is written into it,
+                unless it is locked and has none.
 
         Returns:
             The entries of :attr:`out_keys`, losses and, detached, metrics; with
@@ -284,24 +286,34 @@ class ActorCriticLoss(PolicyLoss):
         """
         transitions, mask = self._read(tensordict)
         weights = self._priority_weights(transitions, mask)
+        if not values_can_be_seen():
+            outputs, td_error = self._outputs(transitions, mask, weights)
+        else:
+            try:
+                outputs, td_error = self._outputs(transitions, mask, weights)
+            except (*UNREADABLE, ValueError) as error:
+                self._explain(error, transitions)
+                raise
+        priority = td_error if mask is None else td_error.where(mask, 0.0)
+        key = self.tensor_keys.priority
+        if not tensordict.is_locked:
+            tensordict.set(key, priority)
+        elif tensordict.get(key, None) is not None:
+            tensordict.set_(key, priority)
+        return self._selected(outputs, transitions.shape)
+
+    def _outputs(
+        self, transitions: TensorDictBase, mask: Tensor | None, weights: Tensor | None
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        """All outputs, checked, and the temporal difference error ``[*B]``."""
         target = self.soft_bellman_target(transitions, mask)
-        qvalue = self._chosen_qvalue(transitions)
+        qvalue = self._chosen_qvalue(transitions, mask)
         td_error = (qvalue.detach() - target).abs().amax(0)
         errors = distance_loss(qvalue, target.expand_as(qvalue), self.loss_function)  # Eq. 10
         states = self.states(transitions)
         surrogate = self.project(states)
         self._check_declared(surrogate.losses, surrogate.metrics)
         lift = states.lift
-        self._check_values(
-            {
-                f"reward {self._reward_key!r}": transitions.get(self._reward_key),
-                "target of the soft Q value": target,
-                "soft Q value": lift.score,
-                "log-probability of the reference policy": lift.actions.log_prob,
-                "temporal difference error": td_error,
-                "loss of the policy": surrogate.loss,
-            }
-        )
         of_all = Reduction(self.reduction, target.shape, mask, weights)
         of_states = of_all.first(self.num_actor_states)
         losses = {"loss_actor": surrogate.loss, **surrogate.losses}
@@ -310,20 +322,25 @@ class ActorCriticLoss(PolicyLoss):
             losses["loss_value"] = distance_loss(value, lift.value, self.loss_function)
         with torch.no_grad():
             metrics = self._metrics(states, surrogate)
-        losses |= self._temperature_losses(lift.actions, metrics, of_states)
-        priority = td_error if mask is None else td_error.where(mask, 0.0)
-        key = self.tensor_keys.priority
-        if not tensordict.is_locked:
-            tensordict.set(key, priority)
-        elif tensordict.get(key, None) is not None:
-            tensordict.set_(key, priority)
-        metrics["tau"], metrics["tau_prime"] = self.temperatures()
+        losses |= self._temperature_losses(states, metrics, of_states)
         outputs = {
             "loss_qvalue": of_all.loss(errors.sum(0)),
             **{name: of_states.loss(loss) for name, loss in losses.items()},
-            **{name: of_states.metric(value) for name, value in metrics.items()},
         }
-        return self._selected(outputs, transitions.shape)
+        source = f"computed from {self._reward_key!r} and Q"
+        self._check_values(
+            {
+                "target of the soft Q value": target,
+                "soft Q value": lift.score,
+                "log-probability of the reference policy": lift.actions.log_prob,
+                "temporal difference error": td_error,
+                "loss of the policy": surrogate.loss,
+                **{f"{name}, {source},": loss for name, loss in outputs.items()},
+            }
+        )
+        metrics["tau"], metrics["tau_prime"] = self.temperatures()
+        outputs |= {name: of_states.metric(value) for name, value in metrics.items()}
+        return outputs, td_error
 
     # ---------------------------------------------------------------------------------- the lift
 
@@ -401,14 +418,16 @@ class ActorCriticLoss(PolicyLoss):
             return self.actor_network.get_dist(inputs)
 
     def _temperature_losses(
-        self, actions: Actions, metrics: Mapping[str, Tensor], reduction: Reduction
+        self, states: States, metrics: Mapping[str, Tensor], reduction: Reduction
     ) -> dict[str, Tensor]:
-        losses = {}
+        losses, actions = {}, states.lift.actions
         if self.target_kl is not None:
             bound = actions.divergence_bound(self.target_kl)
             excess = ((reduction.mean(metrics["kl_target_reference"]) - bound) / bound).clamp(-1, 1)
             losses["loss_tau"] = self.dual("tau", excess.expand(reduction.shape), excess)
         if self.target_entropy is not None:
+            if self.target_entropy != self._reachable and values_can_be_seen():
+                self._check_target_entropy(actions, states.reference, reduction)
             excess = actions.entropy_target(self.target_entropy) - metrics["entropy"]
             losses["loss_tau_prime"] = self.dual("tau_prime", excess, reduction.mean(excess))
         return losses
@@ -424,9 +443,7 @@ class ActorCriticLoss(PolicyLoss):
         """
         with torch.no_grad():
             next_tensordict = tensordict.get("next")
-            ended = next_tensordict.get(
-                self.tensor_keys.done if self.skip_done_states else self.tensor_keys.terminated
-            )
+            ended = self._ended(next_tensordict)
             value = self._next_state_value(next_tensordict, ended.squeeze(-1))
             # Nothing is to come, whatever stands there: NaN times 0 would be NaN.
             value = value.unsqueeze(-1).masked_fill(ended, 0.0)
@@ -439,11 +456,17 @@ class ActorCriticLoss(PolicyLoss):
                 valued.set(done, tensordict.get(done) | ~is_followed)
             return self.value_estimator.value_estimate(valued).squeeze(-1)
 
+    def _ended(self, next_tensordict: TensorDictBase) -> Tensor:
+        """Where nothing is to come, ``[*B, 1]``."""
+        keys = self.tensor_keys
+        return next_tensordict.get(keys.done if self.skip_done_states else keys.terminated)
+
     def _next_state_value(self, tensordict: TensorDictBase, ended: Tensor) -> Tensor:
         """V(s') ``[*B]`` of the delayed value network, or from delayed Q and the reference."""
-        observations = tensordict.select(*self._next_observations)
-        if self.skip_done_states:
-            observations = observations.apply(lambda x: _blank(x, ended))
+        # Distributions refuse NaN, also where nothing comes of it.
+        blank = _blank if self.skip_done_states else _blank_unless_finite
+        observations: Any = tensordict.select(*self._next_observations)
+        observations = observations.apply(lambda x: blank(x, ended))
         if self.value_network is not None:
             return self._state_value(observations, self.target_value_network_params)
         params = self.target_actor_network_params if self.delay_actor else self.actor_network_params
@@ -451,7 +474,7 @@ class ActorCriticLoss(PolicyLoss):
         number, critics = self.num_next_action_samples, self.target_qvalue_network_params
         return self.lift(observations, policy, critics, number).value
 
-    def _chosen_qvalue(self, tensordict: TensorDictBase) -> Tensor:
+    def _chosen_qvalue(self, tensordict: TensorDictBase, mask: Tensor | None = None) -> Tensor:
         """Soft Q ``[N, *B]`` of the actions that were taken; carries the gradient."""
         inputs = tensordict.select(*self.qvalue_network.in_keys)
         qvalues = self._qvalues(inputs, self.qvalue_network_params)
@@ -459,6 +482,9 @@ class ActorCriticLoss(PolicyLoss):
             return qvalues
         action = tensordict.get(self.tensor_keys.action)
         if action.shape == qvalues.shape[1:]:
+            is_one = action == 1
+            is_strange = (is_one.sum(-1) != 1) | (is_one != (action != 0)).any(-1)
+            self._check_action(is_strange, mask, qvalues)
             return (qvalues * action).sum(-1)
         if action.shape == (*qvalues.shape[1:-1], 1):
             action = action.squeeze(-1)
@@ -468,8 +494,19 @@ class ActorCriticLoss(PolicyLoss):
                 f"{tuple(qvalues.shape[1:])} or an integer of shape {tuple(qvalues.shape[1:-1])}, "
                 f"got {action.dtype} of shape {tuple(action.shape)}."
             )
+        self._check_action((action < 0) | (action >= qvalues.shape[-1]), mask, qvalues)
         index = action.long().unsqueeze(-1).expand(*qvalues.shape[:-1], 1)
         return qvalues.gather(-1, index).squeeze(-1)
+
+    def _check_action(self, is_strange: Tensor, mask: Tensor | None, qvalues: Tensor) -> None:
+        is_strange = is_strange if mask is None else is_strange & mask
+        if values_can_be_seen() and is_strange.any():
+            number = qvalues.shape[-1]
+            raise ValueError(
+                f"The action {self.tensor_keys.action!r} must be one of the {number} that the Q "
+                f"network values, 0 to {number - 1}, or one-hot with a single 1; "
+                f"{int(is_strange.sum())} of {is_strange.numel()} are not."
+            )
 
     def _qvalues(self, inputs: TensorDictBase, params: TensorDictParams) -> Tensor:
         """Soft Q of each of the N networks: ``[N, *B]``, or of all actions, ``[N, *B, n]``."""
@@ -632,6 +669,13 @@ class ActorCriticLoss(PolicyLoss):
             get_entry(tensordict, key)
         shape = self._batch_shape(tensordict)
         mask = self._mask(tensordict, shape)
+        for key in self._all_in_keys if tensordict.shape != shape else ():
+            entry = tensordict.get(key)
+            if entry.shape[: len(shape)] != shape:
+                raise ValueError(
+                    f"The entry {key!r} must begin with the shape {list(shape)} of the reward "
+                    f"without its trailing 1, got {list(entry.shape)}."
+                )
         if mask is None and tensordict.shape == shape:
             return tensordict, None
 
@@ -646,23 +690,40 @@ class ActorCriticLoss(PolicyLoss):
         weights = tensordict.get(key, None) if self.use_prioritized_weights else None
         if weights is None:
             return None
-        weights = weights.reshape(tensordict.shape)
-        return weights if mask is None else weights.where(mask, 0.0)
+        shape = tensordict.shape
+        if weights.shape not in (shape, (*shape, 1)):
+            raise ValueError(
+                f"The entry {key!r} must have the shape {list(shape)} of the batch, got "
+                f"{list(weights.shape)}."
+            )
+        weights = weights.reshape(shape)
+        weights = weights if mask is None else weights.where(mask, 0.0)
+        if values_can_be_seen():
+            strange = ~((weights >= 0) & (weights < math.inf))
+            if strange.any():
+                raise ValueError(
+                    f"The entry {key!r} must be finite and at least 0, got "
+                    f"{weights[strange][0]:.3g} and the like in {int(strange.sum())} of "
+                    f"{strange.numel()} places."
+                )
+        return weights
 
     def _batch_shape(self, tensordict: TensorDictBase) -> torch.Size:
         """[*B] of a batch, from its rewards."""
-        shape = tensordict.get(self._reward_key).shape
-        if shape[-1:] != (1,):
+        reward = tensordict.get(self._reward_key)
+        shape = reward.shape
+        if shape[-1:] != (1,) or not shape.numel() or reward.is_complex():
             raise ValueError(
-                f"The reward {self._reward_key!r} must have the shape [*B, 1], got {tuple(shape)}."
+                f"The reward {self._reward_key!r} must be real and have the shape [*B, 1], of one "
+                f"transition at least, got {reward.dtype} of shape {tuple(shape)}."
             )
-        check_real(self._reward_key, tensordict.get(self._reward_key))
         for name in ("done", "terminated"):
             key = unravel_key(("next", getattr(self.tensor_keys, name)))
-            if tensordict.get(key).shape != shape:
+            flag = tensordict.get(key)
+            if flag.shape != shape or flag.dtype != torch.bool:
                 raise ValueError(
-                    f"The entry {key!r} must have the shape {tuple(shape)} of the reward, got "
-                    f"{tuple(tensordict.get(key).shape)}."
+                    f"The entry {key!r} must be boolean and have the shape {tuple(shape)} of the "
+                    f"reward, got {flag.dtype} of shape {tuple(flag.shape)}."
                 )
         return shape[:-1]
 
@@ -673,12 +734,38 @@ class ActorCriticLoss(PolicyLoss):
         for module in reversed(list(actor_network.modules())):
             kind = getattr(module, "distribution_class", None)
             if isinstance(kind, type):
-                if issubclass(kind, CompositeDistribution):
-                    raise ValueError(
-                        f"{type(self).__name__} takes one action, got {kind.__name__}."
-                    )
+                check_policy(kind)
                 self._check_kind(is_discrete(kind))
                 return
+
+    def _check_target_entropy(
+        self, actions: Actions, reference: Distribution, reduction: Reduction
+    ) -> None:
+        """Refuse what no policy can have at these states; once, since masks differ by batch."""
+        target = self.target_entropy
+        is_empty = reduction.mask is not None and not reduction.mask.any()
+        if target is None or is_empty or (target == "auto" and not self._reads_action):
+            return  # "auto" follows the mask
+        value, (low, high) = actions.entropy_target(target), actions.entropy_range(reference)
+        bound = float(reduction.mean(high))
+        if not low < value < bound:
+            raise ValueError(
+                f"target_entropy={target!r} asks for {value:.3g} nats, which no policy has at "
+                f"these states: their actions leave {low:.3g} to {bound:.3g}. Lower or raise it."
+            )
+        self._reachable = target
+
+    def _explain(self, error: Exception, transitions: TensorDictBase) -> None:
+        """Name the entry, or the parameter, that an error comes from, if there is one."""
+        ended = self._ended(transitions.get("next")).squeeze(-1)
+        entries = {key: transitions.get(key) for key in dict.fromkeys(self._all_in_keys)}
+        values = dict(entries)
+        for key in map(unravel_key, (("next", key) for key in self._next_observations)):
+            values[key] = _blank(values[key], ended)  # is not looked at after the end
+        quantities = {f"entry {key!r}": value for key, value in values.items()}
+        self._check_values(quantities | dict(self.named_parameters()) | dict(self.named_buffers()))
+        if not isinstance(error, ValueError):
+            raise unreadable("loss", transitions, list(entries), error) from error
 
     def _check_kind(self, is_discrete: bool) -> None:
         if is_discrete == self._reads_action:
@@ -709,6 +796,14 @@ def _blank(entry: Tensor, where: Tensor) -> Tensor:
     """0 in these places, and True in a mask, as that of the actions that may be taken."""
     where = where.reshape(*where.shape, *(1,) * (entry.ndim - where.ndim))
     return entry.masked_fill(where, entry.dtype == torch.bool)
+
+
+def _blank_unless_finite(entry: Tensor, where: Tensor) -> Tensor:
+    """0 in these places if it is NaN or infinite."""
+    if not entry.is_floating_point():
+        return entry
+    where = where.reshape(*where.shape, *(1,) * (entry.ndim - where.ndim))
+    return entry.masked_fill(where & ~entry.isfinite(), 0)
 
 
 def _written(outputs: TensorDictBase, name: str, key: NestedKey, network: Any) -> Tensor:

@@ -53,7 +53,8 @@ class ECACLoss(ActorCriticLoss):
             fixed, or scheduled by assignment. Default: 0.083, half a nat for six dimensions.
         target_entropy: entropy in nats that tau_prime is learned to hold (``loss_tau_prime``,
             parameter ``log_tau_prime``), as SAC's alpha is; ``"auto"`` (default, SAC's) is -A.
-            None: tau_prime is fixed, or scheduled by assignment.
+            None: tau_prime is fixed, or scheduled by assignment. It must be below the log-volume of
+            the bounds of the actions.
         min_tau: floor of a learned tau. Default: 0.001.
         min_tau_prime: floor of a learned tau_prime. Without one it winds down to nothing while
             the policy lags behind its target. Default: 0.003.
@@ -93,12 +94,14 @@ class ECACLoss(ActorCriticLoss):
     their range), ``qvalue``, ``state_value``, ``tau`` and ``tau_prime``. The
     temporal difference error is written into the input as ``"td_error"``, 0 where the entry
     ``("collector", "mask")`` says that a transition is not real: such transitions are not looked
-    at, whatever stands there.
+    at, whatever stands there. A locked batch keeps the ``"td_error"`` out, unless it has one.
 
     Raises:
-        ValueError: for discrete actions, a Q network that reads no action, a value network without
-            delay, no samples, temperatures that are not allowed, a target_kl that M samples cannot
-            show, an unknown option; when called, for NaN or infinite values.
+        ValueError: for discrete or hybrid actions, a Q network that reads no action, a value
+            network without delay, no samples, temperatures that are not allowed, an unknown or
+            ill-typed option; when called, for a target_kl that M samples cannot show or a
+            target_entropy that no policy has, an entry of another shape or type or without a
+            transition, actions that are none, weights below 0, and NaN or infinite values.
         TypeError: if ``actor_network`` has no ``get_dist``.
         KeyError: when called, for a missing entry.
 
@@ -138,8 +141,8 @@ class ECACLoss(ActorCriticLoss):
     ) -> None:
         check_choice("projection", projection, PROJECTIONS)
         reason = ": weights are relative to those of the other actions"
-        check_count("num_action_samples", num_action_samples, least=2, reason=reason)
-        options |= {"num_action_samples": num_action_samples}
+        number = check_count("num_action_samples", num_action_samples, least=2, reason=reason)
+        options |= {"num_action_samples": number}
         super().__init__(actor_network, qvalue_network, value_network, **options)
         self.projection = projection
 
@@ -176,7 +179,8 @@ class DiscreteECACLoss(ECACLoss):
         tau_prime: default: 0.1.
         target_kl: KL(target, pi_bar) in nats that tau is learned to hold. Default: 0.1.
         target_entropy: ``"auto"`` is 0.98 log n, that of TorchRL's ``DiscreteSACLoss``. Default:
-            None, a fixed tau_prime.
+            None, a fixed tau_prime. n is the number of actions that a mask leaves; other targets
+            lie between 0 and its logarithm.
 
     Examples:
         >>> import torch

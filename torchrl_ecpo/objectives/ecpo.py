@@ -6,6 +6,7 @@ from typing import Literal
 
 from tensordict.nn import ProbabilisticTensorDictSequential
 
+from torchrl_ecpo.checks import check_flag
 from torchrl_ecpo.functional import Surrogate, mean_seeking_projection
 from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, TrajectoryGroups
 
@@ -93,7 +94,7 @@ class ECPOLoss(LiftProjectLoss):
             delay_actor=delay_actor,
             reduction=reduction,
         )
-        self.control_variate = control_variate
+        self.control_variate = check_flag("control_variate", control_variate)
 
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
         """Eq. 6, with weights corrected for the policy that drew the trajectories."""

@@ -1,0 +1,72 @@
+"""Bad transitions and options of the actor-critic losses."""
+
+from __future__ import annotations
+
+import inspect
+
+import pytest
+import torch
+from actor_critic_problems import CASES, FIXED, make_batch, make_networks
+from faults import Subject, check, tensordict_of
+
+from torchrl_ecpo import ActorCriticLoss, PolyakAverage
+
+OPTIONS = {
+    "num_qvalue_nets": 2,
+    "num_action_samples": 4,
+    "num_next_action_samples": 1,
+    "num_actor_states": 3,
+    "loss_function": "l2",
+    "delay_actor": False,
+    "delay_qvalue": True,
+    "target_entropy": None,
+    "target_kl": None,
+    "reduction": "none",
+}
+
+
+def accepted(loss):
+    """The options of a loss, and of its bases."""
+    names = set()
+    for kind in loss.__mro__:
+        if issubclass(kind, ActorCriticLoss):
+            names |= inspect.signature(kind.__init__).parameters.keys()
+    return names
+
+
+def batch(case):
+    entries = make_batch(case.kind).flatten_keys(".").to_dict()
+    entries = {tuple(key.split(".")) if "." in key else key: x for key, x in entries.items()}
+    return entries | {
+        "priority_weight": torch.tensor([1.0, 2, 1, 1, 0.5, 1], dtype=torch.float64),
+        ("collector", "mask"): torch.tensor([True, True, True, True, False, True]),
+    }
+
+
+def call(case, entries):
+    names = [name for name in entries if name in OPTIONS or name in ("tau", "tau_prime", "gamma")]
+    options = {name: entries[name] for name in names}
+    gamma = {"gamma": options.pop("gamma")} if "gamma" in options else {}
+    networks = make_networks(case.kind)
+    loss = case.loss(networks.actor, networks.qvalues[0], **{**FIXED, **options})
+    loss.make_value_estimator(**gamma)
+    loss.to(torch.float64)
+    if any("target" in name for name, _ in loss.named_children()):
+        PolyakAverage(loss)
+    torch.manual_seed(0)
+    data = tensordict_of({key: x for key, x in entries.items() if key not in names}, (6,))
+    losses = loss(data)
+    total = sum(value.sum() for name, value in losses.items() if name.startswith("loss_"))
+    total.backward()
+    gradients = [parameter.grad for parameter in loss.parameters()]
+    return {name: value.detach() for name, value in losses.items()}, gradients
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_actor_critic_losses(name):
+    case = CASES[name]
+    options = {key: x for key, x in OPTIONS.items() if key in accepted(case.loss) and x is not None}
+    entries = batch(case) | options | {"tau": 0.75, "tau_prime": 0.25, "gamma": 0.9}
+    optional = [*options, "tau", "tau_prime", "gamma", "priority_weight", ("collector", "mask")]
+    subject = Subject(lambda entries: call(case, entries), entries, optional=optional)
+    check(f"`{case.loss.__name__}`", subject)
