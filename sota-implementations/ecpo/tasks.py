@@ -173,7 +173,7 @@ def make_gym(config: DictConfig) -> Task:
 def make_mlp_policy(env: EnvBase, hidden_sizes: Sequence[int]) -> ProbabilisticTensorDictSequential:
     """A multi-layer perceptron with a categorical or a tanh-Gaussian head, as the actions ask."""
     spec: Any = env.action_spec
-    if not isinstance(spec, (CategoricalSpec, Bounded)):
+    if not isinstance(env.action_spec, (CategoricalSpec, Bounded)):
         raise ValueError(
             f"env=gym takes tasks with one discrete action or bounded continuous ones, got {spec}."
         )
