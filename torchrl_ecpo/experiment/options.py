@@ -129,8 +129,8 @@ def check_options(
 ) -> None:
     """Refuse options that do not exist or whose value is not of the kind of the default.
 
-    By default ``true`` stands for a flag, ``1`` for an integer of at least 1, ``1.0`` for a number
-    of at least 0, and null for anything.
+    By default ``true`` stands for a flag, ``1`` for an integer of at least 1 (``0``: of at least
+    0), ``1.0`` for a number of at least 0, and null for anything.
 
     Args:
         config: of a run.
@@ -211,8 +211,10 @@ def _check(
 
 
 def _kind_of(default: Any) -> str:
-    usual = {bool: "true or false", int: "an integer >= 1", float: "a number >= 0", str: "text"}
-    usual |= {dict: "a mapping", list: "a list"}
+    if isinstance(default, (int, float)) and not isinstance(default, bool):
+        is_count = isinstance(default, int)
+        return f"an integer >= {min(1, default)}" if is_count else f"a number >= {min(0, default)}"
+    usual = {bool: "true or false", str: "text", dict: "a mapping", list: "a list"}
     return usual.get(type(default), "anything")
 
 
