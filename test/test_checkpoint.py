@@ -212,9 +212,6 @@ def change_record(directory):
         (change_record, (), "metrics.csv does not reach to step 20, .* with the rows that were"),
         (None, ("loss.tau=1", "seed=7"), "loss.tau was 0.01, is 1; seed was 0, is 7. Resume with"),
         (None, ("resume=elsewhere",), "resume=elsewhere is not this run's directory"),
-        (None, ("resume=null", "checkpoint.keep=0"), "checkpoint.keep must be an integer of at"),
-        (None, ("resume=null", "checkpoint.interval=-1"), "checkpoint.interval must be seconds"),
-        (None, ("resume=null", "checkpoint.max_share=0"), r"checkpoint.max_share must lie in \(0"),
     ],
 )
 def test_what_cannot_be_resumed_is_refused(interrupted, start, spoil, options, message):

@@ -173,22 +173,13 @@ def utils(monkeypatch):
         (["env=gym", "env.name=Chess-v0"], "env.name=Chess-v0 is no task of gymnasium"),
         (["env=gym", "env.name=CartPole-v1"], "must be of bounded continuous actions"),
         (["env=dm_control", "env.task=fly"], "env.name=cheetah env.task=fly cannot be made"),
-        (["collector.frames_per_batch=0"], "frames_per_batch must be an integer of at least 1"),
-        (["compile=yes"], "compile must be true or false, got 'yes'"),
-        (["log_interval=70"], "evaluation.interval must be a multiple of log_interval"),
-        (["total_frames=200"], "total_frames must be a multiple of log_interval, or the last"),
-        (["loss.policy_delay=0"], "loss.policy_delay must be an integer of at least 1, got 0"),
-        (["loss.reference_interval=0"], "loss.reference_interval must be an integer of at least"),
-        (["replay_buffer.storage=tape"], "storage must be 'tensor' or 'memmap', got 'tape'"),
         (["~loss.lr.log_tau"], "loss.lr must have a learning rate for each of"),
-        (["loss.options.num_action_samples=0"], "num_action_samples must be"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
 def test_bad_options_end_with_a_clear_message(utils, overrides, message):
     config = configure([*TINY, *overrides])
     with pytest.raises(ValueError, match=message):  # noqa: PT012 - the script's first steps
-        utils.check_config(config)
         env = utils.make_environment(config, seed=0)
         loss_module = utils.make_loss(config, utils.make_actor(config, env), env)
         utils.make_optimizer(config.loss.lr, loss_module)
@@ -202,6 +193,37 @@ def test_a_missing_simulator_is_named_with_its_extra(utils, monkeypatch):
     config = configure(["env=gym", "env.name=Ant-v5"])
     with pytest.raises(ModuleNotFoundError, match=r"Ant-v5 .* pip install '\.\[mujoco\]'"):
         utils.make_environment(config, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (gym.error.DependencyNotInstalled("No pygame: pip install it."), "Pendulum-v1: No pygame:"),
+        (RuntimeError("No display."), r"Pendulum-v1: No display\. MuJoCo .* MUJOCO_GL .* egl"),
+    ],
+)
+def test_a_video_that_cannot_be_drawn_says_what_to_install(utils, monkeypatch, error, message):
+    class Env(utils.GymEnv):
+        def __init__(self, name, *, from_pixels, **options):
+            if from_pixels:
+                raise error from ImportError("pygame")
+            super().__init__(name)
+
+    monkeypatch.setattr(utils, "GymEnv", Env)
+    config = configure(["evaluation.video=true"])
+    with pytest.raises(RuntimeError, match=f"evaluation.video=true cannot draw {message}"):
+        utils.make_environment(config, seed=0, is_evaluation=True)
+    utils.make_environment(config, seed=0)  # training draws nothing
+
+
+def test_workers_of_different_seeds_share_no_data(utils):
+    starts = [
+        utils._make_worker_environment(configure([f"seed={seed}"]), worker).rollout(1)
+        for seed in (0, 1)
+        for worker in (0, 1)
+    ]
+    for key in ("observation", "action"):
+        assert len({str(start[key].tolist()) for start in starts}) == 4, key
 
 
 def test_a_video_of_the_first_episode_is_saved(utils, tmp_path, monkeypatch):

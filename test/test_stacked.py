@@ -16,9 +16,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from tensordict import TensorDict
-from torchrl.envs import InitTracker, TransformedEnv
+from torchrl.envs import GymEnv, InitTracker, TransformedEnv
 
-from torchrl_ecpo.envs import AlgorithmicEnv
+from torchrl_ecpo.envs import AlgorithmicEnv, BanditEnv
 from torchrl_ecpo.experiment import Checkpoints, Run, read_metrics
 from torchrl_ecpo.modules import TupleCategorical, make_softmax_policy, make_tuple_policy
 from torchrl_ecpo.modules.histories import distinct_histories, hash_histories
@@ -176,8 +176,8 @@ def test_what_is_no_list_of_runs_is_refused(script, name, given):
         (["seeds=[0,0]"], "seeds must be a list of different integers"),
         (["stack=['seed=0,1','seed=1']"], "'seed=1' is there twice"),
         (["seeds=[0,1]", "stack=['seed=2']"], "seeds or stack, not both"),
-        (["stack=['loss.tua=1']"], "Could not override 'loss.tua'"),
-        (["stack=['project_steps=0']"], "project_steps must be an integer of at least 1"),
+        (["stack=['loss.tua=1']"], "no option loss.tua; the nearest one is loss.tau"),
+        (["stack=['project_steps=0']"], "project_steps must be an integer >= 1, got 0"),
         (["stack=['env=copy','env=reverse']"], "must agree in env.name, got copy and reverse"),
         (["stack=['seed=0','group_size=5']"], "must agree in group_size, got 100 and 5. They may"),
         (["stack=['seed=0','project_steps=3']"], "have 100 and 300 trajectories: .* end together"),
@@ -226,6 +226,20 @@ def test_histories_of_different_runs_are_not_shared_and_in_order(script):
         own_first = torch.tensor(own.counts).cumsum(0) - torch.tensor(own.counts)
         within = both.nodes[:, rows] - (first + before).unsqueeze(1)
         assert within[mask[:, rows]].equal((own.nodes - own_first.unsqueeze(1))[mask[:, rows]])
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        (lambda: AlgorithmicEnv("reverse"), r"copy in a batch \(1, 1\) and reverse in a batch"),
+        (lambda: AlgorithmicEnv("copy", group_size=2), r"copy in a batch \(1, 1\) and copy in a"),
+        (lambda: BanditEnv(num_actions=3), "and a bandit of 3 actions"),
+        (lambda: GymEnv("CartPole-v1"), "AlgorithmicEnv and BanditEnv can be stacked, got"),
+    ],
+)
+def test_environments_of_different_tasks_are_not_stacked(script, other, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        script("stacked.envs").stack_envs([AlgorithmicEnv("copy"), other()])
 
 
 def test_a_run_samples_and_steps_as_alone(script):

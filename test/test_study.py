@@ -26,6 +26,8 @@ import yaml
 from matplotlib.image import imread
 from rliable.metrics import probability_of_improvement
 
+from torchrl_ecpo.experiment import options
+
 ROOT = Path(__file__).parents[1]
 STUDY, COMMITTED = ROOT / "sota-implementations/study", ROOT / "docs"
 MODULES = ("manifest", "records", "results", "scores", "run", "collect", "report")
@@ -344,6 +346,7 @@ def test_a_directory_with_another_configuration_is_not_touched(study, run, tmp_p
     assert run(path)[0] == 0
     add_option(counter, "new_option: 7")
     study.manifest._compose.cache_clear()
+    options._defaults.cache_clear()
     status, output = run(path)
     assert status == 1
     assert "another configuration: new_option was absent, is 7. Remove it" in output

@@ -34,7 +34,13 @@ from utils import (
 )
 
 from torchrl_ecpo.collectors import shut_down
-from torchrl_ecpo.experiment import Checkpoints, Progress, Run, compile_module
+from torchrl_ecpo.experiment import (
+    Checkpoints,
+    Progress,
+    Run,
+    check_command_line,
+    compile_module,
+)
 
 
 def total(losses: TensorDictBase, is_policy_due: bool) -> Tensor:
@@ -58,7 +64,6 @@ def descend(loss: Tensor, optimizer: torch.optim.Optimizer, kept: nn.Module | No
 
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
 def main(config: DictConfig) -> None:
-    check_config(config)
     checkpoints = Checkpoints(config)
     torch.set_num_threads(config.threads)
 
@@ -142,4 +147,5 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
+    check_command_line(__file__, check_config)
     main()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -44,8 +44,8 @@ from torchrl_ecpo import (
 )
 from torchrl_ecpo._torchrl import carrier_of, generator_of, set_carrier
 from torchrl_ecpo.collectors import SupervisedAsyncCollector, SupervisedSyncCollector
+from torchrl_ecpo.collectors.workers import spawn_seeds
 from torchrl_ecpo.envs import EpisodeReplay
-from torchrl_ecpo.experiment import check_options
 from torchrl_ecpo.modules import (
     make_deterministic_actor,
     make_qvalue_network,
@@ -72,13 +72,8 @@ SHOWN = ("evaluation_return", "return", "entropy", "alpha", "tau", "tau_prime", 
 LONGEST_EPISODE = 100_000
 
 
-def check_config(config: DictConfig) -> None:
-    """Refuse settings with which a run would never end, or break late."""
-    counts = ["total_frames", "log_interval", "updates_per_frame", "collector.frames_per_batch"]
-    counts += ["evaluation.interval", "evaluation.episodes", "loss.policy_delay"]
-    if "reference_interval" in config.loss:
-        counts.append("loss.reference_interval")
-    check_options(config, counts)
+def check_config(config: DictConfig, options: Sequence[str] = ()) -> None:
+    """Refuse options that do not go together."""
     if config.evaluation.interval % config.log_interval:
         raise ValueError(
             "evaluation.interval must be a multiple of log_interval, got "
@@ -89,11 +84,6 @@ def check_config(config: DictConfig) -> None:
             "total_frames must be a multiple of log_interval, or the last frames would not be "
             f"logged, got {config.total_frames} and {config.log_interval}."
         )
-    if config.replay_buffer.storage not in ("tensor", "memmap"):
-        raise ValueError(
-            "replay_buffer.storage must be 'tensor' or 'memmap', got "
-            f"{config.replay_buffer.storage!r}."
-        )
 
 
 # ------------------------------------------------------------------------------------ environments
@@ -101,9 +91,11 @@ def check_config(config: DictConfig) -> None:
 
 def make_environment(config: DictConfig, *, seed: int, is_evaluation: bool = False) -> EnvBase:
     """The task that ``env=`` names, with one vector as observation, in single precision."""
-    with_pixels = is_evaluation and config.evaluation.video
     make = {"gym": _make_gym, "dm_control": _make_dm_control}[config.env.kind]
-    env = make(config.env, from_pixels=with_pixels, pixels_only=False)
+    if is_evaluation and config.evaluation.video:
+        env = _make_with_pixels(config.env, make)
+    else:
+        env = make(config.env, from_pixels=False)
     transforms: list[Any] = [DoubleToFloat(), RewardSum(), StepCounter(), EpisodeReplay()]
     if config.env.kind == "dm_control":
         parts = [key for key in list(env.observation_spec.keys()) if key != "pixels"]
@@ -111,6 +103,24 @@ def make_environment(config: DictConfig, *, seed: int, is_evaluation: bool = Fal
     env = TransformedEnv(env, Compose(*transforms))
     env.set_seed(seed)
     return env
+
+
+def _make_with_pixels(config: DictConfig, make: Callable[..., EnvBase]) -> EnvBase:
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    try:
+        return make(config, from_pixels=True, pixels_only=False)
+    except Exception as error:  # of each renderer another
+        make(config, from_pixels=False).close()  # if it is not the renderer, this says what it is
+        is_ours = isinstance(error, (ModuleNotFoundError, ValueError))
+        reason = str(error.__cause__ if is_ours else error).rstrip(".")
+        hint = (
+            f"MuJoCo draws with OpenGL: MUJOCO_GL (now {os.environ['MUJOCO_GL']}) must be egl, "
+            "with libegl1 installed, osmesa, with libosmesa6, or on a desktop glfw."
+        )
+        raise RuntimeError(
+            f"evaluation.video=true cannot draw {config.name}: {reason}."
+            f" {'' if isinstance(error, ModuleNotFoundError) else hint}"
+        ) from error
 
 
 def _make_gym(config: DictConfig, **options: Any) -> EnvBase:
@@ -124,7 +134,7 @@ def _make_gym(config: DictConfig, **options: Any) -> EnvBase:
 
 def _make_dm_control(config: DictConfig, **options: Any) -> EnvBase:
     # dm_control looks for a display as soon as it is imported.
-    os.environ.setdefault("MUJOCO_GL", "egl" if options["from_pixels"] else "disabled")
+    os.environ.setdefault("MUJOCO_GL", "disabled")
     task = f"env.name={config.name} env.task={config.task}"
     try:
         return DMControlEnv(config.name, config.task, **options)
@@ -268,13 +278,14 @@ def make_collector(config: DictConfig, policy: TensorDictModuleBase) -> Any:
     if config.collector.kind == "single":
         env = make_environment(config, seed=config.seed)
         return Collector(env, policy, track_traj_ids=False, **options)
-    seeds = range(config.seed, config.seed + config.collector.num_collectors)
-    makers = [partial(_make_worker_environment, config, seed) for seed in seeds]
+    workers = range(config.collector.num_collectors)
+    makers = [partial(_make_worker_environment, config, worker) for worker in workers]
     make = {"multi_sync": SupervisedSyncCollector, "multi_async": SupervisedAsyncCollector}
     return make[config.collector.kind](makers, policy, **options)
 
 
-def _make_worker_environment(config: DictConfig, seed: int) -> EnvBase:
+def _make_worker_environment(config: DictConfig, worker: int) -> EnvBase:
+    seed = spawn_seeds(config.seed, worker + 1)[worker]
     torch.manual_seed(seed)  # a worker has a generator of its own, which draws its actions
     return make_environment(config, seed=seed)
 

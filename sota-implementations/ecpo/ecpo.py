@@ -10,11 +10,10 @@ import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from stacked import runs_of, train_stack
+from stacked import check_runs, runs_of, train_stack
 from tasks import make_task
 from torch.nn.utils import clip_grad_norm_
 from utils import (
-    check_config,
     is_single,
     make_collector,
     make_loss,
@@ -25,12 +24,11 @@ from utils import (
 )
 
 from torchrl_ecpo.collectors import shut_down
-from torchrl_ecpo.experiment import Checkpoints, Progress, compile_module
+from torchrl_ecpo.experiment import Checkpoints, Progress, check_command_line, compile_module
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
 def main(config: DictConfig) -> None:
-    check_config(config)
     torch.set_num_threads(config.threads)
     if config.seeds is not None or config.stack is not None:
         configs = runs_of(config, HydraConfig.get().overrides.task)
@@ -90,4 +88,5 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
+    check_command_line(__file__, check_runs)
     main()

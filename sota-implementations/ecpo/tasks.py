@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import gymnasium as gym
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
@@ -18,6 +19,8 @@ from tensordict.nn import (
 )
 from torch import Tensor, nn
 from torch.distributions import Categorical
+from torchrl.data import Bounded
+from torchrl.data import Categorical as CategoricalSpec
 from torchrl.envs import (
     Compose,
     DoubleToFloat,
@@ -134,6 +137,10 @@ def make_algorithmic(config: DictConfig) -> Task:
 
 def make_gym(config: DictConfig) -> Task:
     """A gymnasium task with discrete or continuous actions, with a feed-forward policy."""
+    try:
+        gym.spec(config.env.name)
+    except gym.error.Error as error:
+        raise ValueError(f"env.name={config.env.name} is no task of gymnasium: {error}") from error
 
     def make_copy() -> EnvBase:
         return GymEnv(config.env.name, categorical_action_encoding=True)
@@ -166,6 +173,10 @@ def make_gym(config: DictConfig) -> Task:
 def make_mlp_policy(env: EnvBase, hidden_sizes: Sequence[int]) -> ProbabilisticTensorDictSequential:
     """A multi-layer perceptron with a categorical or a tanh-Gaussian head, as the actions ask."""
     spec: Any = env.action_spec
+    if not isinstance(env.action_spec, (CategoricalSpec, Bounded)):
+        raise ValueError(
+            f"env=gym takes tasks with one discrete action or bounded continuous ones, got {spec}."
+        )
     size = env.observation_spec["observation"].shape[-1]
     mlp = partial(MLP, in_features=size, num_cells=list(hidden_sizes), activation_class=nn.Tanh)
     if spec.dtype == torch.int64:

@@ -14,7 +14,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 
 from torchrl_ecpo import ECPOLoss, MENTLoss, PMDLoss, TrajectoryGroupLoss, UREXLoss
 from torchrl_ecpo.collectors import TrajectoryGroupCollector
-from torchrl_ecpo.experiment import Run, check_options
+from torchrl_ecpo.experiment import Run
 from torchrl_ecpo.schedules import TemperatureScheduler, make_schedule
 
 LOSSES = {
@@ -29,9 +29,7 @@ COMPILABLE = ("bandit", "gym")
 
 
 def check_config(config: DictConfig) -> None:
-    """Refuse settings with which a run would never end, or never begin."""
-    counts = ("total_trajectories", "evaluation_interval", "num_groups", "group_size")
-    check_options(config, (*counts, "project_steps"))
+    """Refuse options that do not go together."""
     if config.compile and not (config.seeds is None and config.stack is None):
         raise ValueError(
             "compile=true is for single runs. Leave out compile, or seeds and stack: --multirun "

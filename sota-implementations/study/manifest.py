@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from torchrl_ecpo.experiment.options import compose_options
 from torchrl_ecpo.experiment.run import differences, flatten
 
 HERE = Path(__file__).resolve().parent
@@ -134,12 +134,9 @@ class Cell:
 @cache
 def _compose(script: Path, options: tuple[str, ...]) -> DictConfig:
     try:
-        with initialize_config_dir(str(script.parent / "config"), version_base="1.3"):
-            config = compose("config", list(options))
-            OmegaConf.resolve(config.copy())
-    except (HydraException, OmegaConfBaseException) as error:
+        return compose_options(script.parent, options)
+    except (ValueError, HydraException, OmegaConfBaseException) as error:
         raise ValueError(f"{script.name} {' '.join(options)} cannot be run: {error}") from error
-    return config
 
 
 def total_option(config: DictConfig) -> str:

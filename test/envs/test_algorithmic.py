@@ -521,6 +521,8 @@ def test_group_ids_are_unique():
             {"task": "duplicated_input", "min_length": 1},
             r"min_length of duplicated_input must lie in 2\.\.30, got 1",
         ),
+        ({"task": ["copy"]}, r"Unknown task \['copy'\]"),
+        ({"seed": 1.5}, "seed must be an integer of at least 0, got 1.5"),
         ({"curriculum": "row"}, "curriculum must be 'group', 'batch', 'gym' or None, got 'row'"),
     ],
 )

@@ -26,7 +26,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_ecpo.envs import GroupedEnv, GroupIdAllocator
+from torchrl_ecpo.envs import AlgorithmicEnv, EpisodeReplay, GroupedEnv, GroupIdAllocator
 from torchrl_ecpo.groups import TrajectoryGroupSampler
 
 # A function of this module could not be imported by worker processes.
@@ -196,11 +196,95 @@ def test_collector_and_sampler():
         (cartpole, (1, 1), r"group_size must be .* at least 2.*got 1"),
         (cartpole, (0, 2), r"num_groups must be .* at least 1, got 0"),
         (lambda: SerialEnv(2, cartpole), (1, 2), r"batch size \(\), got \(2,\)"),
+        ("CartPole-v1", (1, 2), "create_env_fn must be a function that makes a copy"),
+        (GymEnv("CartPole-v1"), (1, 2), "create_env_fn must be a function that makes a copy"),
+        (lambda: None, (1, 2), "must make an environment of TorchRL .* got None"),
     ],
 )
 def test_bad_input(make, sizes, match):
-    with pytest.raises(ValueError, match=match):
+    with pytest.raises((TypeError, ValueError), match=match):
         GroupedEnv(make, num_groups=sizes[0], group_size=sizes[1])
+
+
+class SeveralActions(gymnasium.Env):
+    observation_space = gymnasium.spaces.MultiDiscrete([4, 5])
+    action_space = gymnasium.spaces.MultiDiscrete([2, 3])
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.integers([4, 5]), {}
+
+    def step(self, action):
+        return numpy.array([0, 0]), float(action @ [1, 10]), True, False, {}
+
+
+@pytest.mark.parametrize(("categorical", "width"), [(True, 2), (False, 5)])
+def test_groups_over_several_discrete_actions(categorical, width):
+    def make():
+        return GymWrapper(SeveralActions(), categorical_action_encoding=categorical)
+
+    env = GroupedEnv(make, num_groups=2, group_size=30)
+    check_env_specs(env, seed=0)
+    played = env.rollout(2)
+    assert played["action"].shape == (2, 30, 1, width)
+    assert sorted(played["next", "reward"].unique()) == [0, 1, 10, 11, 20, 21], "each action"
+    assert (played["observation"] == played["observation"][:, :1]).all()
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "a"])
+def test_what_is_no_seed_is_refused(seed):
+    env = GroupedEnv(cartpole, num_groups=1, group_size=2)
+    with pytest.raises(ValueError, match="seed must be an integer of at least 0, got"):
+        env.set_seed(seed)
+
+
+@pytest.mark.parametrize(
+    ("make", "other"),
+    [
+        (
+            lambda: GroupedEnv(cartpole, num_groups=2, group_size=2),
+            lambda: GroupedEnv(cartpole, num_groups=1, group_size=2),  # which would be broadcast
+        ),
+        (
+            lambda: GroupedEnv(cartpole, num_groups=1, group_size=2),
+            lambda: GroupedEnv(lambda: GymEnv("Acrobot-v1"), num_groups=1, group_size=2),
+        ),
+        (
+            lambda: TransformedEnv(GymEnv("Pendulum-v1"), EpisodeReplay()),
+            lambda: TransformedEnv(GymEnv("MountainCarContinuous-v0"), EpisodeReplay()),
+        ),
+        (lambda: AlgorithmicEnv("copy"), lambda: AlgorithmicEnv("reverse")),
+        (lambda: AlgorithmicEnv("copy", num_groups=2), lambda: AlgorithmicEnv("copy")),
+        (
+            lambda: AlgorithmicEnv("copy"),
+            lambda: AlgorithmicEnv("copy", curriculum="batch"),  # of as many levels
+        ),
+    ],
+)
+def test_the_state_of_another_environment_is_refused(make, other):
+    env = make()
+    env.reset()
+    before = str(env.state_dict())
+    strange = other()
+    strange.rollout(2)
+    with pytest.raises(ValueError, match=r"The state is of another environment: of .*, and"):
+        env.load_state_dict(strange.state_dict())
+    assert str(env.state_dict()) == before
+    env.load_state_dict(make().state_dict())
+
+
+def test_a_state_from_before_states_had_an_owner_is_taken():
+    env = AlgorithmicEnv("copy")
+    state = {name: value for name, value in env.state_dict().items() if name != "_extra_state"}
+    AlgorithmicEnv("copy").load_state_dict(state)
+
+
+def test_episodes_of_other_environments_are_not_replayed():
+    env = TransformedEnv(SerialEnv(2, cartpole), EpisodeReplay())
+    with pytest.raises(
+        TypeError, match=r"one task of gymnasium or dm_control, got SerialEnv\. Put"
+    ):
+        env.reset()
 
 
 class Careless(gymnasium.Env):

@@ -1,12 +1,17 @@
-"""Group ids: one integer for each problem instance."""
+"""Group ids, one integer for each problem instance; and which environment a state is of."""
 
 from __future__ import annotations
 
 import os
 import secrets
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
+from torchrl.envs import EnvBase
+
+from torchrl_ecpo.checks import check_count
 
 _COUNTER_BITS = 24
 _PREFIX_BITS = 63 - _COUNTER_BITS
@@ -65,6 +70,8 @@ class GroupIdAllocator:
         Raises:
             ValueError: if one call asks for more ids than the counter holds.
         """
+        check_count("count", count, least=0)
+        check_count("stride", stride)
         span = count * stride
         if span > 1 << _COUNTER_BITS:
             raise ValueError(
@@ -77,3 +84,19 @@ class GroupIdAllocator:
         start = self._prefix + self._count
         self._count += span
         return torch.arange(start, start + span, stride)
+
+
+def describe(env: EnvBase) -> str:
+    """What an environment gives and takes, by which others are told apart."""
+    specs = (own.items(True, True) for own in (env.full_observation_spec, env.full_action_spec))
+    entries = ", ".join(
+        f"{name} {tuple(spec.shape)} {spec.dtype}" for own in specs for name, spec in own
+    )
+    return f"{entries} in a batch {tuple(env.batch_size)}"
+
+
+def check_owner(state: Mapping[str, Any], own: str) -> None:
+    """Refuse the state of another environment; one written before states had an owner is taken."""
+    owner = state.get("env", own)
+    if owner != own:
+        raise ValueError(f"The state is of another environment: of {owner}, and this is {own}.")

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from torchrl.data import Categorical, Composite, MultiCategorical, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_ecpo.checks import check_count
-from torchrl_ecpo.envs._groups import GroupIdAllocator
+from torchrl_ecpo.checks import check_count, get_entry
+from torchrl_ecpo.envs._groups import GroupIdAllocator, check_owner
 
 __all__ = ["TASKS", "AlgorithmicEnv", "AlgorithmicTask"]
 
@@ -331,7 +331,8 @@ class AlgorithmicEnv(EnvBase):
             episodes on every device. Default: the CPU.
 
     Raises:
-        ValueError: if an argument, a given instance or an action is out of range.
+        ValueError: if an argument, a given instance or an action is out of range, and for the state
+            of another environment.
 
     Examples:
         >>> import torch
@@ -377,12 +378,14 @@ class AlgorithmicEnv(EnvBase):
         device: torch.device | str | int | None = None,
     ) -> None:
         """Make the environment; the class describes the arguments."""
-        if task not in TASKS:
+        if not isinstance(task, str) or task not in TASKS:
             raise ValueError(f"Unknown task {task!r}: expected one of {', '.join(TASKS)}.")
         self.task_name, self.task = task, TASKS[task]
         self._check_arguments(num_groups, group_size, min_length, curriculum)
         batch_size = (num_groups, group_size)
         super().__init__(batch_size=batch_size, device=device)
+        if seed is not None:
+            check_count("seed", seed, least=0)
         level = self.task.min_length if min_length is None else min_length
         self.curriculum = _Curriculum(curriculum, batch_size, level, self.task.last, self.device)
         # In gym's curriculum the copies of a draw may differ in level: room for an id a level.
@@ -411,6 +414,19 @@ class AlgorithmicEnv(EnvBase):
             raise ValueError(
                 f"curriculum must be 'group', 'batch', 'gym' or None, got {curriculum!r}."
             )
+
+    def get_extra_state(self) -> dict[str, str]:
+        """Which environment the state is of."""
+        kind, batch = self.curriculum.kind, tuple(self.batch_size)
+        return {"env": f"{self.task_name} in a batch {batch} with the curriculum {kind!r}"}
+
+    def set_extra_state(self, state: dict[str, str]) -> None:
+        """It was checked before anything was loaded."""
+
+    def _load_from_state_dict(self, state_dict: dict, prefix: str, *args: object) -> None:
+        own = self.get_extra_state()
+        check_owner(state_dict.setdefault(f"{prefix}_extra_state", own), own["env"])
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def _make_specs(self) -> None:
         batch, device, base = self.batch_size, self.device, self.task.base
@@ -576,7 +592,7 @@ class AlgorithmicEnv(EnvBase):
         return ids.view(self.batch_size).gather(1, first).view(-1)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = tensordict.get("action")
+        action = get_entry(tensordict, "action")
         if action.shape != self._action_shape or action.dtype != torch.int64:
             raise ValueError(
                 f"'action' must be int64 of shape {list(self._action_shape)}, "

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_ecpo.checks import check_count
+from torchrl_ecpo.checks import as_float, check_count, get_entry
 from torchrl_ecpo.envs._groups import GroupIdAllocator
 
 __all__ = ["BanditEnv"]
@@ -36,7 +36,8 @@ class BanditEnv(EnvBase):
         device: where the bandit lives.
 
     Raises:
-        ValueError: if a size is not positive; when stepped, for an action that does not exist.
+        ValueError: if a size is not positive, or another argument negative; when stepped, for an
+            action that does not exist.
 
     Examples:
         >>> env = BanditEnv(num_actions=4, group_size=3)
@@ -66,6 +67,9 @@ class BanditEnv(EnvBase):
         check_count("num_features", num_features)
         check_count("num_groups", num_groups)
         check_count("group_size", group_size)
+        check_count("instance_seed", instance_seed, least=0)
+        if not 0 <= as_float("exponent", exponent) < float("inf"):
+            raise ValueError(f"exponent must be a finite number >= 0, got {exponent!r}.")
         super().__init__(batch_size=torch.Size([num_groups, group_size]), device=device)
         generator = torch.Generator().manual_seed(instance_seed)
         rewards = torch.rand(num_actions, generator=generator).pow(exponent)
@@ -92,14 +96,24 @@ class BanditEnv(EnvBase):
 
     def expected_reward(self, probabilities: Tensor) -> Tensor:
         """Exact expected reward ``[...]`` of action probabilities ``[..., num_actions]``."""
+        if probabilities.shape[-1:] != self.rewards.shape[-1:]:
+            raise ValueError(
+                f"probabilities must be [..., {self.rewards.shape[-1]}], one for each action, got "
+                f"the shape {tuple(probabilities.shape)}."
+            )
         return probabilities @ self.rewards
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         return self._output(done=False)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = tensordict["action"]
+        action = get_entry(tensordict, "action")
         num_actions = self.rewards.shape[-1]
+        if action.shape != self.batch_size or action.dtype not in (torch.int64, torch.int32):
+            raise ValueError(
+                f"'action' must be int64 of shape {list(self.batch_size)}, got {action.dtype} of "
+                f"shape {list(action.shape)}."
+            )
         if bool(((action < 0) | (action >= num_actions)).any().item()):
             raise ValueError(
                 f"An action of the bandit must be an integer from 0 to {num_actions - 1}, got "

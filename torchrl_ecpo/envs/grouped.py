@@ -15,7 +15,7 @@ from torchrl.data.utils import CloudpickleWrapper
 from torchrl.envs import EnvBase, GymWrapper, ParallelEnv, SerialEnv, TransformedEnv
 
 from torchrl_ecpo.checks import check_count, check_flag, check_group_size
-from torchrl_ecpo.envs._groups import GroupIdAllocator
+from torchrl_ecpo.envs._groups import GroupIdAllocator, check_owner, describe
 from torchrl_ecpo.groups import GROUP_KEY
 
 __all__ = ["GroupedEnv"]
@@ -48,7 +48,9 @@ class GroupedEnv(EnvBase):
     Noise of their own must come from a generator that a reset does not seed.
 
     Raises:
-        ValueError: if `group_size` is below 2, `num_groups` below 1, or a copy has a batch size.
+        TypeError: if `create_env_fn` is no function, or makes no environment of TorchRL.
+        ValueError: if `group_size` is below 2, `num_groups` below 1, or a copy has a batch size;
+            for a negative seed, and for the state of another environment.
         RuntimeError: at a reset of everything, if the copies of a row do not start alike.
 
     Examples:
@@ -76,6 +78,11 @@ class GroupedEnv(EnvBase):
         """Make the environment; the class describes the arguments."""
         num_groups = check_count("num_groups", num_groups)
         group_size = check_group_size(group_size)
+        if isinstance(create_env_fn, EnvBase) or not callable(create_env_fn):
+            raise TypeError(
+                "create_env_fn must be a function that makes a copy, such as "
+                f'lambda: GymEnv("CartPole-v1"), got {create_env_fn!r}.'
+            )
         batched = ParallelEnv if check_flag("parallel", parallel) else SerialEnv
         copies = batched(
             num_groups * group_size, CloudpickleWrapper(partial(_make_copy, create_env_fn))
@@ -97,12 +104,15 @@ class GroupedEnv(EnvBase):
     def _copy_specs(self) -> None:
         rows = self.batch_size
         for name in ("observation", "action", "state", "reward", "done"):
-            spec = getattr(self.copies, f"full_{name}_spec").unflatten(0, rows)
+            # The copies are alike, and some specs cannot be unflattened.
+            spec = getattr(self.copies, f"full_{name}_spec")[0].expand(rows)
             if name == "observation":
                 spec[GROUP_KEY] = Unbounded(shape=rows, dtype=torch.int64, device=self.device)
             setattr(self, f"full_{name}_spec", spec)
 
     def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            check_count("seed", seed, least=0)
         self._seed = secrets.randbits(63) if seed is None else seed
         self._ids = GroupIdAllocator()  # an instance of another seed is another one
         self._episode = np.zeros(self.batch_size, dtype=int)  # of each copy, the next one
@@ -154,10 +164,11 @@ class GroupedEnv(EnvBase):
 
     def get_extra_state(self) -> dict[str, Any]:
         """The seed and what was played of it; an episode that is being played is not in it."""
-        return {"seed": self._seed, "episode": self._episode.tolist()}
+        return {"env": describe(self), "seed": self._seed, "episode": self._episode.tolist()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Go on with the next instances; the environment must be reset."""
+        check_owner(state, describe(self))
         self._set_seed(state["seed"])
         self._episode[:] = state["episode"]
 
@@ -169,7 +180,13 @@ class GroupedEnv(EnvBase):
 
 
 def _make_copy(create_env_fn: Callable[[], EnvBase]) -> EnvBase:
-    return _SeededEnv(create_env_fn(), auto_unwrap=False)
+    env = create_env_fn()
+    if not isinstance(env, EnvBase):
+        raise TypeError(
+            "create_env_fn must make an environment of TorchRL (of gymnasium's: GymWrapper), got "
+            f"{env!r}."
+        )
+    return _SeededEnv(env, auto_unwrap=False)
 
 
 class _SeededEnv(TransformedEnv):

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import GymWrapper, Transform
+from torchrl.envs import DMControlWrapper, GymWrapper, Transform
+
+from torchrl_ecpo.envs._groups import check_owner, describe
 
 __all__ = ["EpisodeReplay"]
 
@@ -24,6 +26,10 @@ class EpisodeReplay(Transform):
 
     Only the simulator is put where it was: what an episode has summed or counted so far travels in
     the tensordict that the caller holds.
+
+    Raises:
+        TypeError: if it is not on one task of gymnasium or dm_control.
+        ValueError: for the state of another environment.
 
     Examples:
         >>> import torch
@@ -59,6 +65,7 @@ class EpisodeReplay(Transform):
         """The random generator's state before the last reset, and the actions since."""
         is_begun = self._start is not None
         return {
+            "env": describe(self._task()),
             "is_begun": is_begun,
             "start": self._start or self._random_state(),
             "actions": list(self._actions),
@@ -66,13 +73,14 @@ class EpisodeReplay(Transform):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Play the episode again, up to where it was."""
+        check_owner(state, describe(self._task()))
         self._set_random_state(state["start"])
         if not state["is_begun"]:
             return
-        env: Any = self.container
-        step = env.base_env.reset()
+        env = self._task()
+        step = env.reset()
         for action in state["actions"]:
-            step = env.base_env.step(TensorDict({**step, "action": action}))["next"]
+            step = env.step(TensorDict({**step, "action": action}))["next"]
             step = step.exclude("reward")
         self._start, self._actions = state["start"], list(state["actions"])
 
@@ -89,8 +97,17 @@ class EpisodeReplay(Transform):
         else:
             generator.bit_generator.state = json.loads(state)
 
+    def _task(self) -> Any:
+        env = getattr(self.container, "base_env", None)
+        if not isinstance(env, (GymWrapper, DMControlWrapper)):
+            raise TypeError(
+                "EpisodeReplay is a transform of one task of gymnasium or dm_control, got "
+                f"{type(env).__name__}. Put it on each copy: TransformedEnv(GymEnv(...), "
+                "EpisodeReplay())."
+            )
+        return env
+
     def _generator(self) -> Any:
-        container: Any = self.container
         # TorchRL hands on what it does not know to gymnasium's or dm_control's environment.
-        env = container.base_env
+        env = self._task()
         return env.np_random if isinstance(env, GymWrapper) else env.task.random

@@ -2,14 +2,17 @@
 
 from torchrl_ecpo.experiment.checkpoint import Checkpoints, Progress
 from torchrl_ecpo.experiment.compiling import compile_module
-from torchrl_ecpo.experiment.run import MetricsTable, Run, check_options, read_metrics
+from torchrl_ecpo.experiment.options import check_command_line, check_options, compose_options
+from torchrl_ecpo.experiment.run import MetricsTable, Run, read_metrics
 
 __all__ = [
     "Checkpoints",
     "MetricsTable",
     "Progress",
     "Run",
+    "check_command_line",
     "check_options",
     "compile_module",
+    "compose_options",
     "read_metrics",
 ]

@@ -24,47 +24,16 @@ from torch import Tensor
 from torchrl.record.loggers import Logger, get_logger
 from tqdm import tqdm
 
-from torchrl_ecpo.checks import check_choice, check_count
+from torchrl_ecpo.checks import check_choice
 from torchrl_ecpo.experiment.figures import plot_learning_curve
 
-__all__ = ["METRICS_FILE", "MetricsTable", "Run", "check_options", "read_metrics"]
+__all__ = ["METRICS_FILE", "MetricsTable", "Run", "read_metrics"]
 
 METRICS_FILE = "metrics.csv"
 BACKENDS = ("csv", "tensorboard", "wandb")
 RECORDED_PACKAGES = ("torchrl-ecpo", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
 
 Metrics = Mapping[str, float | Tensor]
-
-
-def check_options(config: DictConfig, counts: Sequence[str]) -> None:
-    """Refuse options that both scripts have, with which a run would never end, or break late.
-
-    Args:
-        config: of the run.
-        counts: names of options that must be integers of at least 1, beside ``threads`` and
-            ``checkpoint.keep``.
-
-    Raises:
-        ValueError: naming the option, what was expected, and what came.
-
-    Examples:
-        >>> config = OmegaConf.create({"seed": 1, "compile": False, "threads": 1, "size": {"k": 0}})
-        >>> check_options(config, ["size.k"])
-        Traceback (most recent call last):
-            ...
-        ValueError: size.k must be an integer of at least 1, got 0.
-    """
-    for name in (*counts, "threads", "checkpoint.keep"):
-        check_count(name, OmegaConf.select(config, name))
-    if not isinstance(config.seed, int):
-        raise ValueError(f"seed must be an integer, got {config.seed!r}.")
-    if not isinstance(config.compile, bool):
-        raise ValueError(f"compile must be true or false, got {config.compile!r}.")
-    interval, max_share = config.checkpoint.interval, config.checkpoint.max_share
-    if interval is not None and not (isinstance(interval, (int, float)) and interval >= 0):
-        raise ValueError(f"checkpoint.interval must be seconds or null, got {interval!r}.")
-    if not isinstance(max_share, (int, float)) or not 0 < max_share <= 1:
-        raise ValueError(f"checkpoint.max_share must lie in (0, 1], got {max_share!r}.")
 
 
 class MetricsTable:

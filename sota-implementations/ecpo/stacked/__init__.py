@@ -6,7 +6,7 @@ policy on what was collected. R is the number of runs; a batch ``[R * num_groups
 holds them one after another.
 """
 
-from stacked.options import runs_of
+from stacked.options import check_runs, runs_of
 from stacked.training import Stack, train_stack
 
-__all__ = ["Stack", "runs_of", "train_stack"]
+__all__ = ["Stack", "check_runs", "runs_of", "train_stack"]

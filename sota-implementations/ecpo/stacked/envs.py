@@ -21,7 +21,21 @@ from torchrl_ecpo.envs import AlgorithmicEnv, BanditEnv
 def stack_envs(envs: Sequence[Any]) -> EnvBase:
     """Put environments of one type, task and batch size behind one; step them through it alone."""
     kinds = {AlgorithmicEnv: _StackedAlgorithmicEnv, BanditEnv: _StackedBanditEnv}
+    types = {type(env) for env in envs}
+    if not types <= kinds.keys():
+        raise TypeError(f"AlgorithmicEnv and BanditEnv can be stacked, got {types}.")
+    described = dict.fromkeys(map(_describe, envs))
+    if len(described) != 1:
+        raise ValueError(
+            f"Stacked environments must be of one task and size, got {' and '.join(described)}."
+        )
     return kinds[type(envs[0])](envs)
+
+
+def _describe(env: Any) -> str:
+    is_bandit = isinstance(env, BanditEnv)
+    task = f"a bandit of {env.rewards.shape[-1]} actions" if is_bandit else env.task_name
+    return f"{task} in a batch {tuple(env.batch_size)}"
 
 
 class _StackedAlgorithmicEnv(AlgorithmicEnv):
@@ -43,7 +57,7 @@ class _StackedAlgorithmicEnv(AlgorithmicEnv):
             curriculum=None,
             seed=0,
         )
-        for name in [key for key in first.state_dict() if "." not in key]:
+        for name in [key for key in first.state_dict() if "." not in key and "extra" not in key]:
             whole = getattr(self, name)
             for env, part in zip(envs, whole.chunk(len(envs)), strict=True):
                 setattr(env, name, part.copy_(getattr(env, name)))

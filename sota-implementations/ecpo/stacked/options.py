@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
-import itertools
 import shlex
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
-from hydra import compose
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from utils import check_config
 
+from torchrl_ecpo.experiment.options import compose_options, expand, parse
 from torchrl_ecpo.experiment.run import flatten
 
+FOLDER = Path(__file__).parents[1]
 KINDS = ("algorithmic", "bandit")
 MAY_DIFFER = (
     *("seed", "loss", "optim", "project_steps", "anneal_from", "evaluation_interval"),
     *("env.curriculum", "env.instance_seed"),
 )
+
+
+def check_runs(config: DictConfig, overrides: Sequence[str]) -> None:
+    """Refuse a run, or stacked ones, whose options do not go together."""
+    check_config(config)
+    if config.seeds is not None or config.stack is not None:
+        runs_of(config, overrides)
 
 
 def runs_of(config: DictConfig, overrides: Sequence[str]) -> dict[str, DictConfig]:
@@ -32,12 +38,12 @@ def runs_of(config: DictConfig, overrides: Sequence[str]) -> dict[str, DictConfi
     Raises:
         ValueError: for runs that cannot be stacked; the message names the option.
     """
-    shared = {own.key_or_group: str(own.input_line) for own in _parse(overrides)}
+    shared = {own.key_or_group: str(own.input_line) for own in parse(overrides)}
     shared = {name: line for name, line in shared.items() if name not in ("seeds", "stack")}
     runs = []
     for options in _asked_for(config):
-        own = {override.key_or_group: str(override.input_line) for override in _parse(options)}
-        runs.append(compose("config", list({**shared, **own}.values())))
+        own = {override.key_or_group: str(override.input_line) for override in parse(options)}
+        runs.append(compose_options(FOLDER, list({**shared, **own}.values())))
         check_config(runs[-1])
     _check_together(runs)
     if config.stack is None:
@@ -62,7 +68,7 @@ def _asked_for(config: DictConfig) -> list[list[str]]:
             "stack must be a list of options, such as stack=['loss=ecpo seed=0,1','loss=urex'], or "
             f"null for a single run, got {stack!r}."
         )
-    runs = [run for entry in stack for run in _expand(shlex.split(entry))]
+    runs = [run for entry in stack for run in expand(shlex.split(entry))]
     twice = [" ".join(run) for run in runs if runs.count(run) > 1]
     if twice:
         raise ValueError(f"stack: {twice[0]!r} is there twice.")
@@ -72,21 +78,6 @@ def _asked_for(config: DictConfig) -> list[list[str]]:
 def _is_list(value: Any, kind: type) -> bool:
     is_list = isinstance(value, ListConfig) and len(value) > 0
     return is_list and all(type(item) is kind for item in value)
-
-
-def _expand(options: list[str]) -> list[list[str]]:
-    """Every combination of the values that options are given, as hydra's ``--multirun`` has it."""
-    choices = [
-        [f"{own.key_or_group}={value}" for value in own.sweep_string_iterator()]
-        if own.is_sweep_override()
-        else [str(own.input_line)]
-        for own in _parse(options)
-    ]
-    return [list(run) for run in itertools.product(*choices)]
-
-
-def _parse(options: Sequence[str]) -> list[Override]:
-    return OverridesParser.create().parse_overrides(list(options))
 
 
 def _check_together(runs: Sequence[DictConfig]) -> None:
