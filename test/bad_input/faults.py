@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils._pytree import tree_flatten
 
 import torchrl_ecpo
@@ -145,6 +145,16 @@ def faults_of(value: Any) -> Iterator[Fault]:
     else:
         kinds = {bool: _of_switch, int: _of_count, float: _of_float, str: _of_choice}
         yield from kinds[type(value)](value)
+
+
+NO_NETWORKS = (
+    Fault("text", lambda: "text"),
+    Fault("None", lambda: None),
+    Fault("a plain module", lambda: nn.Linear(3, 4)),
+    Fault("a class", lambda: nn.Linear),
+    Fault("a list", lambda: []),
+)
+"""Of what makes a network."""
 
 
 class Subject(NamedTuple):

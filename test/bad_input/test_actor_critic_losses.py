@@ -7,7 +7,7 @@ import inspect
 import pytest
 import torch
 from actor_critic_problems import CASES, FIXED, make_batch, make_networks
-from faults import Subject, check, tensordict_of
+from faults import NO_NETWORKS, Subject, check, tensordict_of
 
 from torchrl_ecpo import ActorCriticLoss, PolyakAverage
 
@@ -15,14 +15,16 @@ OPTIONS = {
     "num_qvalue_nets": 2,
     "num_action_samples": 4,
     "num_next_action_samples": 1,
-    "num_actor_states": 3,
+    "num_actor_states": None,
     "loss_function": "l2",
     "delay_actor": False,
     "delay_qvalue": True,
     "target_entropy": None,
     "target_kl": None,
-    "reduction": "none",
+    "reduction": "mean",
 }
+
+NETWORKS = ("actor_network", "qvalue_network")
 
 
 def accepted(loss):
@@ -47,14 +49,15 @@ def call(case, entries):
     names = [name for name in entries if name in OPTIONS or name in ("tau", "tau_prime", "gamma")]
     options = {name: entries[name] for name in names}
     gamma = {"gamma": options.pop("gamma")} if "gamma" in options else {}
-    networks = make_networks(case.kind)
-    loss = case.loss(networks.actor, networks.qvalues[0], **{**FIXED, **options})
+    networks = {network: entries[network]() for network in NETWORKS if network in entries}
+    torch.manual_seed(0)
+    loss = case.loss(**networks, **{**FIXED, **options})
     loss.make_value_estimator(**gamma)
     loss.to(torch.float64)
     if any("target" in name for name, _ in loss.named_children()):
         PolyakAverage(loss)
-    torch.manual_seed(0)
-    data = tensordict_of({key: x for key, x in entries.items() if key not in names}, (6,))
+    others = (*names, *NETWORKS)
+    data = tensordict_of({key: x for key, x in entries.items() if key not in others}, (6,))
     losses = loss(data)
     total = sum(value.sum() for name, value in losses.items() if name.startswith("loss_"))
     total.backward()
@@ -67,6 +70,15 @@ def test_actor_critic_losses(name):
     case = CASES[name]
     options = {key: x for key, x in OPTIONS.items() if key in accepted(case.loss) and x is not None}
     entries = batch(case) | options | {"tau": 0.75, "tau_prime": 0.25, "gamma": 0.9}
+    entries["actor_network"] = lambda: make_networks(case.kind).actor
+    entries["qvalue_network"] = lambda: make_networks(case.kind).qvalues[0]
     optional = [*options, "tau", "tau_prime", "gamma", "priority_weight", ("collector", "mask")]
-    subject = Subject(lambda entries: call(case, entries), entries, optional=optional)
+    fine = {("action", "flags"): "one-hot"} if case.kind == "one_hot" else {}
+    subject = Subject(
+        lambda entries: call(case, entries),
+        entries,
+        faults=dict.fromkeys(NETWORKS, NO_NETWORKS),
+        fine=fine,
+        optional=optional,
+    )
     check(f"`{case.loss.__name__}`", subject)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from faults import Subject, check, tensordict_of
+from faults import NO_NETWORKS, Subject, check, tensordict_of
 from trajectory_problems import CASES, LIFTING, MASK, make_actor, sample
 
 OPTIONS = ("tau", "tau_prime", "delay_actor", "reduction", "control_variate")
@@ -26,12 +26,12 @@ def good(kind, *, dtype=torch.float64):
 def call(case, kind):
     def run(entries):
         options = {name: entries[name] for name in OPTIONS if name in entries}
-        actor = make_actor(kind)
-        loss_module = case.loss(actor, **options)
-        batch = {key: value for key, value in entries.items() if key not in OPTIONS}
+        networks = {n: entries[n]() for n in ("actor_network",) if n in entries}
+        loss_module = case.loss(**networks, **options)
+        batch = {key: x for key, x in entries.items() if key not in (*OPTIONS, "actor_network")}
         losses = loss_module(tensordict_of(batch, SHAPE))
         losses["loss_actor"].sum().backward()
-        gradients = [parameter.grad for parameter in actor.parameters()]
+        gradients = [parameter.grad for parameter in loss_module.parameters()]
         return {name: value.detach() for name, value in losses.items()}, gradients
 
     return run
@@ -44,8 +44,14 @@ def subject(name, kind):
         options["delay_actor"] = False
     if name == "ecpo":
         options["control_variate"] = False
-    entries = good(kind) | options
-    return Subject(call(case, kind), entries, fine=FINE, optional=(MASK, "group", *options))
+    entries = good(kind) | options | {"actor_network": lambda: make_actor(kind)}
+    return Subject(
+        call(case, kind),
+        entries,
+        faults={"actor_network": NO_NETWORKS},
+        fine=FINE,
+        optional=(MASK, "group", *options),
+    )
 
 
 @pytest.mark.parametrize("kind", ["categorical", "normal"])

@@ -13,6 +13,7 @@ from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
+    TensorDictModuleBase,
     dispatch,
 )
 from tensordict.utils import NestedKey, unravel_key
@@ -30,6 +31,7 @@ from torchrl_ecpo.checks import (
     check_choice,
     check_count,
     check_flag,
+    check_real,
     get_entry,
     unreadable,
     values_can_be_seen,
@@ -225,18 +227,22 @@ class ActorCriticLoss(PolicyLoss):
         num_qvalue_nets: int,
         value_network: TensorDictModule | None,
     ) -> None:
-        if isinstance(qvalue_network, (list, tuple)):
+        is_list = isinstance(qvalue_network, (list, tuple))
+        for network in qvalue_network if is_list else [qvalue_network]:
+            _check_network("qvalue_network", network)
+        if is_list:
             different = len({id(network) for network in qvalue_network})
             if not 2 <= different == len(qvalue_network) == num_qvalue_nets:
                 # TorchRL takes one network, or the same one twice, for one that is not trained.
                 raise ValueError(
-                    f"A list of Q networks must hold num_qvalue_nets={num_qvalue_nets} different "
-                    f"ones, at least 2, got {different} in {len(qvalue_network)}. A network by "
-                    "itself, without a list, is copied and drawn anew for each."
+                    f"A list as qvalue_network must hold num_qvalue_nets={num_qvalue_nets} "
+                    f"different ones, at least 2, got {different} in {len(qvalue_network)}. A "
+                    "network by itself, without a list, is copied and drawn anew for each."
                 )
         if value_network is None:
             self.value_network = None
         else:
+            _check_network("value_network", value_network)
             self.convert_to_functional(value_network, "value_network", create_target_params=True)
         self.convert_to_functional(
             qvalue_network,  # pyright: ignore[reportArgumentType] - a list is allowed
@@ -328,8 +334,10 @@ class ActorCriticLoss(PolicyLoss):
             **{name: of_states.loss(loss) for name, loss in losses.items()},
         }
         source = f"computed from {self._reward_key!r} and Q"
+        action = transitions.get(self.tensor_keys.action)
         self._check_values(
             {
+                f"entry {self.tensor_keys.action!r}": action,
                 "target of the soft Q value": target,
                 "soft Q value": lift.score,
                 "log-probability of the reference policy": lift.actions.log_prob,
@@ -488,7 +496,8 @@ class ActorCriticLoss(PolicyLoss):
             return (qvalues * action).sum(-1)
         if action.shape == (*qvalues.shape[1:-1], 1):
             action = action.squeeze(-1)
-        if action.shape != qvalues.shape[1:-1] or action.is_floating_point():
+        no_index = action.is_floating_point() or action.dtype == torch.bool
+        if action.shape != qvalues.shape[1:-1] or no_index:
             raise ValueError(
                 f"The action {self.tensor_keys.action!r} must be one-hot of shape "
                 f"{tuple(qvalues.shape[1:])} or an integer of shape {tuple(qvalues.shape[1:-1])}, "
@@ -583,8 +592,14 @@ class ActorCriticLoss(PolicyLoss):
 
         Raises:
             NotImplementedError: for an estimator that needs more than values.
-            ValueError: for an estimator with a value network.
+            ValueError: for an estimator with a value network, and for a ``gamma`` or ``lmbda``
+                that is not in [0, 1].
         """
+        for name in ("gamma", "lmbda"):
+            if name in hyperparams:
+                hyperparams[name] = as_float(name, hyperparams[name])
+                if not 0 <= hyperparams[name] <= 1:
+                    raise ValueError(f"{name} must be in [0, 1], got {hyperparams[name]}.")
         value_type = self.default_value_estimator if value_type is None else value_type
         if isinstance(value_type, (ValueEstimators, str)):
             supported = self.SUPPORTED_VALUE_ESTIMATORS
@@ -687,10 +702,10 @@ class ActorCriticLoss(PolicyLoss):
 
     def _priority_weights(self, tensordict: TensorDictBase, mask: Tensor | None) -> Tensor | None:
         key = self.tensor_keys.priority_weight
-        weights = tensordict.get(key, None) if self.use_prioritized_weights else None
-        if weights is None:
+        if not self.use_prioritized_weights or key not in tensordict.keys(True):
             return None
-        shape = tensordict.shape
+        weights, shape = get_entry(tensordict, key), tensordict.shape
+        check_real(key, weights)
         if weights.shape not in (shape, (*shape, 1)):
             raise ValueError(
                 f"The entry {key!r} must have the shape {list(shape)} of the batch, got "
@@ -815,3 +830,10 @@ def _written(outputs: TensorDictBase, name: str, key: NestedKey, network: Any) -
             f"that out_key, or name another with set_keys({name}=...)."
         )
     return value
+
+
+def _check_network(name: str, network: Any) -> None:
+    if not isinstance(network, TensorDictModuleBase):
+        raise TypeError(
+            f"{name} must be a TensorDictModule, such as ValueOperator, got {network!r:.60}."
+        )
