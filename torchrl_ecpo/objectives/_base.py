@@ -106,7 +106,7 @@ class PolicyLoss(LossModule):
         if name not in buffers:
             super().__setattr__(name, value)
             return
-        buffers[name].fill_(self.allowed_temperatures(**{name: value})[name])
+        buffers[name].fill_(self.allowed_temperatures(**{name: as_float(name, value)})[name])
 
     def allowed_temperatures(self, **values: Any) -> dict[str, float]:
         """Numbers, by name; refuse those that are not allowed beside the other temperatures.

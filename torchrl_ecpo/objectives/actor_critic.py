@@ -779,7 +779,7 @@ class ActorCriticLoss(PolicyLoss):
             values[key] = _blank(values[key], ended)  # is not looked at after the end
         quantities = {f"entry {key!r}": value for key, value in values.items()}
         self._check_values(quantities | dict(self.named_parameters()) | dict(self.named_buffers()))
-        if not isinstance(error, ValueError):
+        if not isinstance(error, (ValueError, KeyError)):  # ours, which name what they mean
             raise unreadable("loss", transitions, list(entries), error) from error
 
     def _check_kind(self, is_discrete: bool) -> None:
