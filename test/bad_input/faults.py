@@ -275,6 +275,6 @@ def _is_clear(error: Exception, entry: Any) -> bool:
     is_ours = trace.tb_frame.f_code.co_filename.startswith(OURS)
     # Python itself names an argument that is missing, torch an entry of a module's state.
     is_ours |= isinstance(error, TypeError) and "required" in message
-    message = message.removeprefix("Error(s) in loading state_dict for AlgorithmicEnv:\n\t")
-    is_ours |= message != str(error)
+    if message.startswith("Error(s) in loading state_dict"):
+        is_ours, message = True, message.partition("\t")[2]
     return is_ours and name in message and "\n" not in message.strip() and len(message) < 600

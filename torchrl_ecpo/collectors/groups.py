@@ -101,8 +101,8 @@ class TrajectoryGroupCollector(PlayerCollector):
         storing_device: of the batches. Default: the environment's.
 
     Raises:
-        TypeError: for an argument that does not go with groups, and for an environment that writes
-            anything but tensors.
+        TypeError: for an argument that does not go with groups or is of another class, and for an
+            environment that writes anything but tensors.
         ValueError: if `K` is below 2 or not the environment's, if `G` is no multiple, or if the
             environment makes groups of another size.
         KeyError: if the environment has no `group_key`.

@@ -42,6 +42,8 @@ class SupervisedSyncCollector(PlayerCollector):
         options: what else ``Collector`` takes.
 
     Raises:
+        TypeError: if `create_env_fn` is no sequence of functions, or `policy` no function.
+        ValueError: for numbers of frames that are none.
         ChildProcessError: if a worker dies.
     """
 

@@ -40,7 +40,7 @@ class GroupIdAllocator:
         It is a hash of 63 bits: a million of them collide with a probability of one in 20 million.
 
         Args:
-            key: non-negative integers.
+            key: non-negative integers; anything else is a ValueError.
         """
         key = tuple(check_count("key", part, least=0) for part in key)
         self._renew_elsewhere()

@@ -45,6 +45,9 @@ def smooth(values: np.ndarray, fraction: float = 0.02) -> np.ndarray:
         values: ``[n]``.
         fraction: of n, from 0 to 1; at least one value.
 
+    Raises:
+        ValueError: for another fraction.
+
     Examples:
         >>> smooth(np.array([0.0, 2.0, 4.0, 6.0]), fraction=0.5).tolist()
         [0.0, 1.0, 3.0, 5.0]

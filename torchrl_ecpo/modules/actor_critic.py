@@ -66,8 +66,9 @@ class DenseNetwork(TensorDictModuleBase):
         final_gain: factor of the last layer's parameters at the start. Default: 1.
 
     Raises:
-        ValueError: if a size is no integer of at least 1, or if ``final_gain`` is negative or not
-            finite.
+        TypeError: if keys are no lists of names, or ``head`` is no function.
+        ValueError: if a size is no integer of at least 1, if ``final_gain`` is negative or not
+            finite, and for entries that it cannot read.
 
     Examples:
         >>> import torch

@@ -36,6 +36,9 @@ def record_latents(policy: nn.Module) -> None:
     Args:
         policy: whose ``ProbabilisticTensorDictModule`` draw the actions; changed in place.
 
+    Raises:
+        TypeError: if it is no module.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict

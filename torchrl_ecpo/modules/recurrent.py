@@ -74,8 +74,8 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
 
     Raises:
         KeyError: if `is_init` is missing, or the state of a row that continues.
-        ValueError: if an input is out of range; in recurrent mode without a time dimension, or for
-            a sequence that begins in the middle of a trajectory.
+        ValueError: if an input is out of range or cannot be read; in recurrent mode without a time
+            dimension, or for a sequence that begins in the middle of a trajectory.
 
     Examples:
         >>> import torch

@@ -19,6 +19,10 @@ class LinearSoftmax(nn.Module):
     Args:
         features: ``[num_actions, num_features]``, fixed. theta starts at zero: the uniform policy.
 
+    Raises:
+        TypeError: if features are no tensor.
+        ValueError: if they are no matrix of finite numbers.
+
     Examples:
         >>> logits = LinearSoftmax(torch.eye(4))
         >>> logits(torch.ones(2, 3, 1)).shape  # one row for each observation, all equal
@@ -55,6 +59,9 @@ class SharedCategorical(Distribution):
 
     Args:
         logits: ``[..., num_actions]``, all rows equal; only the first one is read.
+
+    Raises:
+        ValueError: if logits are no floating-point numbers, or actions no integers.
 
     Examples:
         >>> dist = SharedCategorical(logits=torch.zeros(4).expand(2, 3, 4))

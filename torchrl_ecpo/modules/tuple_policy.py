@@ -51,7 +51,7 @@ class TupleCategorical(Distribution):
 
     Raises:
         ValueError: if nvec is not of the form (moves, 2, characters), L is another size, or a logit
-            is NaN.
+            is NaN or infinity (-infinity: what is never taken).
 
     Examples:
         >>> import torch
