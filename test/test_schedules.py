@@ -98,7 +98,6 @@ def test_scheduler_continues_from_its_state():
     [
         ({"tau": (0.5, 0.0), "tau_prime": (0.2, 0.0)}, r"end: tau \+ tau_prime must be positive"),
         ({"tau": (0.5, 0.0)}, r"end: tau \+ tau_prime must be positive"),  # the other is 0
-        ({"tau": (0.5, -1.0)}, "end: tau must be a finite number >= 0, got -1.0"),
     ],
 )
 def test_schedules_that_end_where_the_loss_is_not_defined(schedules, message):
@@ -130,15 +129,16 @@ def test_schedule_from_a_configuration(setting, at_five):
     ("make", "message"),
     [
         (lambda: linear(1.0, 0.0, 0), "duration must be positive, got 0"),
-        (lambda: exponential(1.0, 0.1, -1), "duration must be positive, got -1"),
+        (lambda: exponential(1.0, 0.1, -1), "duration must be .*, got -1"),
         (lambda: exponential(1.0, 0.0, 10), "Use a linear one to reach 0"),
         (lambda: make_schedule({"schedule": "cosine"}), "one of .*linear.*, got 'cosine'"),
         (lambda: make_schedule({"start": 1.0}), "got None"),
         (lambda: make_schedule({"schedule": "linear", "start": 1.0}), "Wrong arguments.*'end'"),
         (lambda: TemperatureScheduler(Loss(), tua=constant(1.0)), r"no temperature 'tua'.*'tau'"),
-        (lambda: linear(1.0, 0.0, math.nan), "duration must be finite, got nan"),
+        (lambda: linear(1.0, 0.0, math.nan), "duration must be .*, got nan"),
+        (lambda: linear(0.5, -1.0, 5), "end must be at least 0 and finite, got -1"),
         (lambda: linear("a", 0.0, 5), "start must be a number, got 'a'"),
-        (lambda: constant(math.inf), "start must be finite, got inf"),
+        (lambda: constant(math.inf), "value must be .*finite, got inf"),
         (lambda: make_schedule("high"), "no mapping must be a number, got 'high'"),
         (lambda: make_schedule({"schedule": ["linear"]}), r"one of .*got \['linear'\]"),
         (lambda: theorem1_schedules(1), "num_trajectories must be at least 2"),

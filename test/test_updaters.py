@@ -278,7 +278,6 @@ class TestErrors:
     @pytest.mark.parametrize(
         ("make_loss", "networks", "message"),
         [
-            (lambda: nn.Linear(1, 1), (), "must be a LossModule, got Linear"),
             (
                 sac,
                 ("actor",),
@@ -367,8 +366,8 @@ class TestUpdaterSequence:
     @pytest.mark.parametrize(
         ("make_updaters", "message"),
         [
-            (lambda a, b: [], "at least one updater"),
-            (lambda a, b: [PolyakAverage(a), a], "takes TargetNetUpdaters, got SACLoss"),
+            (lambda a, b: [], "updaters, at least one"),
+            (lambda a, b: [PolyakAverage(a), a], "must be TargetNetUpdaters, got SACLoss"),
             (lambda a, b: [PolyakAverage(a), PolyakAverage(b)], "must belong to one loss"),
             (
                 lambda a, b: [PolyakAverage(a), PeriodicCopy(a, "actor_network", interval=2)],
@@ -432,7 +431,7 @@ class TestCheckpoints:
             (averages, copies.state_dict(), r"PolyakAverage has the entries \['initialized'\]"),
             (copies, {}, r"got \[\]"),
             (half, averages.state_dict(), r"entries \['averages', 'initialized'\], got \['ini"),
-            (half, half.state_dict() | {"averages": {}}, r"averages in the state are of \[\], not"),
+            (half, half.state_dict() | {"averages": {}}, r"averages of .*'actor_network.*missing"),
             (sequence, copies.state_dict(), "one entry, 'updaters', with 2 states"),
             (sequence, {"updaters": [copies.state_dict()]}, "one entry, 'updaters', with 2"),
         ]

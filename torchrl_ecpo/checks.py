@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
 from numbers import Integral
+from types import NoneType
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase, is_non_tensor
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
 from torchrl_ecpo._torch import is_transformed
@@ -26,6 +28,32 @@ def check_count(name: str, value: Any, *, least: int = 1, reason: str = "") -> i
     if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
         raise ValueError(f"{name} must be an integer of at least {least}{reason}, got {value!r}.")
     return int(value)
+
+
+def check_counts(name: str, values: Any) -> tuple[int, ...]:
+    """Integers of at least 1, as Python's own; refuse anything else."""
+    if not isinstance(values, (Sequence, np.ndarray)) or isinstance(values, (str, bytes)):
+        raise TypeError(f"{name} must be a sequence of integers, got {values!r}.")
+    return tuple(check_count(f"Each of {name}", value) for value in values)
+
+
+def check_kind(name: str, value: Any, *kinds: Any) -> None:
+    """Refuse what is an object of none of the classes."""
+    if not isinstance(value, kinds):
+        expected = " or ".join("None" if kind is NoneType else kind.__name__ for kind in kinds)
+        raise TypeError(f"{name} must be a {expected}, got {described(value)}.")
+
+
+def check_keys(name: str, keys: Any) -> list[Any]:
+    """Names of entries; refuse anything else, such as one name that is in no list."""
+    try:
+        if not keys or isinstance(keys, (str, Mapping)):
+            raise TypeError
+        return [unravel_key(key) for key in keys]
+    except (TypeError, RuntimeError):
+        raise TypeError(
+            f"{name} must list names of entries, such as ['observation'], got {keys!r}."
+        ) from None
 
 
 def check_flag(name: str, value: Any, *others: Any) -> Any:
@@ -117,18 +145,31 @@ def unreadable(
     """An error that names the entries which a network could not read."""
     if isinstance(error, torch.OutOfMemoryError):
         raise error
-    told = []
-    for key in keys:
-        value = tensordict.get(key, None)
-        if value is None:
-            told.append(f"{key!r} (missing)")
-        elif isinstance(value, Tensor):
-            told.append(f"{key!r} {value.dtype} {tuple(value.shape)}")
-        else:
-            told.append(f"{key!r} ({type(value).__name__})")
+    values = {key: tensordict.get(key, None) for key in keys}
+    told = [f"{key!r} {'(missing)' if x is None else described(x)}" for key, x in values.items()]
     reason = str(error).strip().splitlines()[0]
     kind = KeyError if isinstance(error, KeyError) else ValueError
     return kind(f"The {network} cannot be evaluated on {', '.join(told)}: {reason}")
+
+
+def names_entries(network: Callable[..., Any]) -> Callable[..., Any]:
+    """Let a module's method say which of its entries it cannot read."""
+
+    @wraps(network)
+    def named(self: Any, tensordict: TensorDictBase, *arguments: Any) -> Any:
+        try:
+            return network(self, tensordict, *arguments)
+        except UNREADABLE as error:
+            name = f"network ({type(self).__name__})"
+            raise unreadable(name, tensordict, self.in_keys, error) from error
+
+    return named
+
+
+def described(value: Any) -> str:
+    """Type and shape of a tensor, the class of anything else."""
+    is_tensor = isinstance(value, Tensor)
+    return f"{value.dtype} {tuple(value.shape)}" if is_tensor else type(value).__name__
 
 
 def present(tensordict: TensorDictBase) -> str:

@@ -1,4 +1,4 @@
-"""Temperatures over time.
+"""Temperatures over time, numbers of at least 0.
 
 A schedule is a function from a count to a temperature. What is counted is the caller's choice:
 project steps, lifts or trajectories; :class:`TemperatureScheduler` counts what ``step`` is told.
@@ -14,7 +14,7 @@ from typing import Any
 from torchrl.objectives import LossModule
 
 from torchrl_ecpo._torchrl import schedulable_buffers
-from torchrl_ecpo.checks import as_float
+from torchrl_ecpo.checks import as_float, check_kind
 from torchrl_ecpo.functional import theorem1_temperatures
 from torchrl_ecpo.objectives._base import PolicyLoss
 
@@ -38,7 +38,8 @@ def constant(value: float) -> Schedule:
         >>> constant(0.5)(1_000)
         0.5
     """
-    return _schedule(_linear, start=value, end=value, duration=1.0)
+    value = _number("value", value)
+    return partial(_linear, start=value, end=value, duration=1.0)
 
 
 def linear(start: float, end: float, duration: float) -> Schedule:
@@ -100,11 +101,11 @@ def make_schedule(setting: float | Mapping[str, Any]) -> Schedule:
         0.5
     """
     if not isinstance(setting, Mapping):
-        return constant(as_float("A schedule that is no mapping", setting))
+        return constant(_number("A setting that is no mapping", setting))
     arguments = dict(setting)
     kind = arguments.pop("schedule", None)
     if kind not in [*_SCHEDULES]:
-        raise ValueError(f"schedule must be one of {sorted(_SCHEDULES)}, got {kind!r}.")
+        raise ValueError(f"A setting's schedule must be one of {sorted(_SCHEDULES)}, got {kind!r}.")
     try:
         return _SCHEDULES[kind](**arguments)
     except TypeError as error:
@@ -144,6 +145,7 @@ class TemperatureScheduler:
     """
 
     def __init__(self, loss_module: LossModule, **schedules: Schedule) -> None:
+        check_kind("loss_module", loss_module, LossModule)
         known = getattr(loss_module, "temperature_names", None) or schedulable_buffers(loss_module)
         for name, schedule in schedules.items():
             if name not in known:
@@ -151,11 +153,13 @@ class TemperatureScheduler:
                     f"{type(loss_module).__name__} has no temperature {name!r} to schedule; "
                     f"it has {list(known)}."
                 )
-            if not callable(schedule):
+            try:
+                float(schedule(0.0))
+            except TypeError as error:
                 raise TypeError(
-                    f"The schedule of {name} must be a function of a count, such as "
-                    f"constant({schedule!r}), got {schedule!r}."
-                )
+                    f"The schedule of {name} must be a function from a count to a number, such as "
+                    f"constant(0.5), got {schedule!r}: {error}."
+                ) from error
         self.loss_module = loss_module
         self.schedules = schedules
         self.count = 0.0
@@ -169,9 +173,7 @@ class TemperatureScheduler:
 
     def step(self, count: float = 1) -> None:
         """Advance by ``count``, at least 0, and write the temperatures."""
-        if not 0 <= as_float("count", count) < math.inf:
-            raise ValueError(f"count must be at least 0 and finite, got {count}.")
-        self.count += count
+        self.count += _number("count", count)
         self._write()
 
     def values(self) -> dict[str, float]:
@@ -189,7 +191,7 @@ class TemperatureScheduler:
 
     def load_state_dict(self, state_dict: dict[str, float]) -> None:
         """Continue at a saved count, and write its temperatures."""
-        self.count = state_dict["count"]
+        self.count = _number("count", state_dict["count"])
         self._write()
 
 
@@ -211,10 +213,15 @@ def _theorem1(count: float, index: int, num_trajectories: int, horizon: int | No
 
 
 def _schedule(function: Callable[..., float], **numbers: Any) -> Schedule:
-    """From a start to an end; refuse what are no numbers."""
-    for name, value in numbers.items():
-        if not math.isfinite(as_float(name, value)):
-            raise ValueError(f"{name} must be finite, got {value}.")
+    """From a start to an end; refuse what are no temperatures."""
+    numbers = {name: _number(name, value) for name, value in numbers.items()}
     if not numbers["duration"] > 0:
         raise ValueError(f"duration must be positive, got {numbers['duration']}.")
     return partial(function, **numbers)
+
+
+def _number(name: str, value: Any) -> float:
+    number = as_float(name, value)
+    if not 0 <= number < math.inf:
+        raise ValueError(f"{name} must be at least 0 and finite, got {value}.")
+    return number

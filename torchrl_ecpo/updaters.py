@@ -58,7 +58,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule, TargetNetUpdater
 
 from torchrl_ecpo._torchrl import networks_with_updater
-from torchrl_ecpo.checks import as_float, check_count
+from torchrl_ecpo.checks import as_float, check_count, check_flag, check_kind
 
 __all__ = ["PeriodicCopy", "PolyakAverage", "UpdaterSequence"]
 
@@ -77,8 +77,7 @@ class _NetworkUpdater(TargetNetUpdater):
     """The name of the subclass's option, for ``repr``."""
 
     def __init__(self, loss_module: LossModule, *networks: str) -> None:
-        if not isinstance(loss_module, LossModule):
-            raise ValueError(f"loss_module must be a LossModule, got {type(loss_module).__name__}.")
+        check_kind("loss_module", loss_module, LossModule)
         self.loss_module = loss_module
         self.networks = _delayed_networks(loss_module, networks)
         with warnings.catch_warnings():
@@ -130,7 +129,10 @@ class _NetworkUpdater(TargetNetUpdater):
                 f"The state of a {type(self).__name__} has the entries {sorted(expected)}, got "
                 f"{sorted(state_dict)}: was it saved by another kind of updater?"
             )
-        super().load_state_dict(state_dict)
+        initialized = check_flag("initialized", state_dict["initialized"])
+        if "counter" in expected:
+            self.counter = check_count("counter", state_dict["counter"], least=0)
+        self.initialized = initialized
 
     def _pairs(self) -> Iterator[tuple[str, Tensor, Tensor]]:
         """Yields the name and the data of every network tensor and its copy, buffers included."""
@@ -174,8 +176,9 @@ class PeriodicCopy(_NetworkUpdater):
         counter: calls since the last copy, from 0 to N - 1; part of the state dict.
 
     Raises:
-        ValueError: if ``loss_module`` is no LossModule, if a network is unknown, not delayed or
-            named twice, or if ``interval`` is not a positive int.
+        TypeError: if ``loss_module`` is no LossModule.
+        ValueError: if a network is unknown, not delayed or named twice, or if
+            ``interval`` is not a positive int.
     """
 
     option = "interval"
@@ -220,8 +223,9 @@ class PolyakAverage(_NetworkUpdater):
             actor-critic runs.
 
     Raises:
-        ValueError: if ``loss_module`` is no LossModule, if a network is unknown, not delayed or
-            named twice, or if ``weight`` is not in (0, 1].
+        TypeError: if ``loss_module`` is no LossModule.
+        ValueError: if a network is unknown, not delayed or named twice, or if
+            ``weight`` is not in (0, 1].
     """
 
     option = "weight"
@@ -269,12 +273,14 @@ class PolyakAverage(_NetworkUpdater):
         """
         own, given = self.state_dict().get("averages", {}), state_dict.get("averages", {})
         super().load_state_dict(state_dict)
-        if {n: x.shape for n, x in own.items()} != {n: x.shape for n, x in given.items()}:
+        check_kind("averages", given, Mapping)
+        wrong = [n for n in own | given if n not in own or not _is_like(given.get(n), own[n])]
+        if wrong:
             raise ValueError(
-                f"The averages in the state are of {sorted(given)}, not of this updater's "
-                f"{sorted(own)} or of other shapes: was it saved with other networks?"
+                f"The averages of {wrong} in the state are missing, not this updater's, or no "
+                "finite single-precision numbers of its shapes: was it saved with other networks?"
             )
-        self._averages = {name: average.clone() for name, average in given.items()}
+        self._averages = {name: average.detach().clone() for name, average in given.items()}
 
 
 class UpdaterSequence(TargetNetUpdater):
@@ -335,8 +341,9 @@ class UpdaterSequence(TargetNetUpdater):
         Raises:
             ValueError: if it is not the state of a sequence of as many updaters of the same kinds.
         """
-        states = state_dict.get("updaters", [])
-        if state_dict.keys() != {"updaters"} or len(states) != len(self.updaters):
+        states = state_dict.get("updaters", None)
+        is_list = isinstance(states, (list, tuple)) and all(isinstance(x, Mapping) for x in states)
+        if state_dict.keys() != {"updaters"} or not is_list or len(states) != len(self.updaters):
             raise ValueError(
                 f"The state of this UpdaterSequence has one entry, 'updaters', with "
                 f"{len(self.updaters)} states, got {dict(state_dict)}."
@@ -347,6 +354,12 @@ class UpdaterSequence(TargetNetUpdater):
     def __repr__(self) -> str:
         lines = "".join(f"    {updater!r},\n" for updater in self.updaters)
         return f"{type(self).__name__}(\n{lines})"
+
+
+def _is_like(given: Any, own: Tensor) -> bool:
+    """Whether it is a finite tensor of the same kind."""
+    is_like = isinstance(given, Tensor) and (given.shape, given.dtype) == (own.shape, own.dtype)
+    return is_like and bool(given.isfinite().all())
 
 
 def _is_half(tensor: Tensor) -> bool:
@@ -374,12 +387,13 @@ def _delayed_networks(loss_module: LossModule, networks: tuple[str, ...] = ()) -
 def _owners(updaters: tuple[TargetNetUpdater, ...]) -> dict[str, TargetNetUpdater]:
     """The updater of each network; refuses what is no sequence."""
     if not updaters:
-        raise ValueError("UpdaterSequence needs at least one updater.")
+        raise ValueError("UpdaterSequence needs updaters, at least one.")
     owners: dict[str, TargetNetUpdater] = {}
     for updater in updaters:
         if not isinstance(updater, TargetNetUpdater):
             raise ValueError(
-                f"UpdaterSequence takes TargetNetUpdaters, got {type(updater).__name__}."
+                "The updaters of an UpdaterSequence must be TargetNetUpdaters, got "
+                f"{type(updater).__name__}."
             )
         if updater.loss_module is not updaters[0].loss_module:
             raise ValueError(

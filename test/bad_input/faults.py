@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import FunctionType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -135,6 +136,22 @@ def _of_choice(x: str) -> Iterator[Fault]:
     yield from (Fault(repr(value), value) for value in values)
 
 
+def _of_sizes(x: Sequence[int]) -> Iterator[Fault]:
+    yield from (Fault(repr(value), value) for value in ((), None, 3, "text", b"ab", {}, 1j))
+    for value in (0, -1, 2.5, "3", None, True, math.nan, [3]):
+        yield Fault(f"with {value!r}", (value, *x[1:]))
+    yield Fault("list", list(x), x)
+    yield Fault("numpy", np.array(x), x)
+    yield Fault("tensor", torch.tensor(x), x)
+
+
+def _of_object(x: Any) -> Iterator[Fault]:
+    yield from (Fault(repr(value), value) for value in (None, "text", 3, math.nan, [], {}))
+    if not isinstance(x, FunctionType):  # whose class is callable, too
+        yield Fault("its class", type(x))
+    yield Fault("an object", object())
+
+
 def faults_of(value: Any) -> Iterator[Fault]:
     """The faults of a good value, by its kind."""
     if isinstance(value, Tensor):
@@ -143,8 +160,14 @@ def faults_of(value: Any) -> Iterator[Fault]:
         else:
             yield from (_of_numbers if value.is_floating_point() else _of_integers)(value)
     else:
-        kinds = {bool: _of_switch, int: _of_count, float: _of_float, str: _of_choice}
-        yield from kinds[type(value)](value)
+        kinds = {
+            bool: _of_switch,
+            int: _of_count,
+            float: _of_float,
+            str: _of_choice,
+            tuple: _of_sizes,
+        }
+        yield from kinds.get(type(value), _of_object)(value)
 
 
 NO_NETWORKS = (
@@ -260,6 +283,8 @@ def _is_clear(error: Exception, entry: Any) -> bool:
         trace = trace.tb_next
     assert trace is not None
     is_ours = trace.tb_frame.f_code.co_filename.startswith(OURS)
-    # Python itself names an argument that is missing.
+    # Python itself names an argument that is missing, torch an entry of a module's state.
     is_ours |= isinstance(error, TypeError) and "required" in message
+    if message.startswith("Error(s) in loading state_dict"):
+        is_ours, message = True, message.partition("\t")[2]
     return is_ours and name in message and "\n" not in message.strip() and len(message) < 600

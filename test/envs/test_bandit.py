@@ -111,7 +111,5 @@ def test_an_action_of_another_kind_is_refused(action):
 
 
 def test_probabilities_of_other_actions_are_refused():
-    with pytest.raises(
-        ValueError, match=r"probabilities must be \[\.\.\., 6\].*got the shape \(4,\)"
-    ):
+    with pytest.raises(ValueError, match=r"probabilities must be .*\[\.\.\., 6\].* \(4,\)"):
         BanditEnv(num_actions=6).expected_reward(torch.ones(4) / 4)

@@ -149,7 +149,7 @@ def test_what_is_repeated_is_read_as_its_copy_would_be():
     outputs = [network.each(entries, params)["out"] for entries in (whole, copied)]
     torch.testing.assert_close(*outputs)
     for shape in ((16, 25, 36), (400, 36), (8, 25, 2, 36)):
-        with pytest.raises(RuntimeError, match=r"Sizes of tensors must match|same number of dim"):
+        with pytest.raises(ValueError, match=r"Sizes of tensors must match|same number of dim"):
             network.each(TensorDict(a=inputs["a"], b=torch.zeros(shape)), params)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
+from types import NoneType
 from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
@@ -11,6 +12,7 @@ from torch import nn
 from torchrl.collectors import BaseCollector
 from torchrl.data import ReplayBuffer
 
+from torchrl_ecpo.checks import check_count, check_flag, check_kind, described
 from torchrl_ecpo.collectors.workers import Workers, spawn_seeds
 from torchrl_ecpo.groups import MASK_KEY, unpack_groups
 
@@ -41,7 +43,14 @@ class PlayerCollector(BaseCollector):
         super().__init__()
         self._learner = self._moded = policy
         self._modes = _modes_of(policy)
+        total_frames = check_count("total_frames", total_frames, least=-1)
         self.total_frames: float = float("inf") if total_frames < 0 else total_frames
+        for name, value, kind in (
+            ("policy", policy, Callable),
+            ("postproc", postproc, Callable),
+            ("replay_buffer", replay_buffer, ReplayBuffer),
+        ):
+            check_kind(name, value, kind, NoneType)
         self.postproc, self.replay_buffer = postproc, replay_buffer
         self.closed, self._frames, self._iter = False, 0, -1
 
@@ -103,11 +112,18 @@ class PlayerCollector(BaseCollector):
             source = own.data
         elif source is None and self._has_factory:
             raise ValueError("policy_factory made the policy: give its weights.")
-        if isinstance(source, TensorDictBase):  # a function has no weights
+        if isinstance(source, TensorDictBase):
             self._workers.set_weights(source)
+        elif source is not self._learner:  # which may be a function, without weights
+            raise TypeError(
+                "policy_or_weights must be a module or a TensorDict of weights, got "
+                f"{described(source)}."
+            )
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seed the environments, those of several workers differently; return a seed to go on."""
+        seed = check_count("seed", seed, least=0)
+        static_seed = check_flag("static_seed", static_seed)
         several = len(self._workers) > 1
         seeds = spawn_seeds(seed, len(self._workers)) if several else [seed]
         return self._workers.call("set_seed", seeds, [static_seed] * len(seeds))[-1]
@@ -122,8 +138,10 @@ class PlayerCollector(BaseCollector):
 
     def load_state_dict(self, state_dict: OrderedDict[str, Any]) -> None:
         """Go on from what :meth:`state_dict` returned."""
+        frames = check_count("frames", state_dict["frames"], least=0)
+        count = check_count("iter", state_dict["iter"], least=-1)
         self._workers.call("load_state_dict", state_dict["players"])
-        self._frames, self._iter = state_dict["frames"], state_dict["iter"]
+        self._frames, self._iter = frames, count
 
     def shutdown(
         self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True
@@ -133,6 +151,14 @@ class PlayerCollector(BaseCollector):
         if not self.closed:
             self.closed = True
             self._workers.stop(timeout)
+
+
+def check_makers(makers: list[Any], *others: Any) -> None:
+    """Refuse what makes no environment."""
+    if not makers:
+        raise ValueError("create_env_fn must hold a maker of an environment for each worker.")
+    for maker in makers:
+        check_kind("create_env_fn", maker, Callable, *others)
 
 
 def _modes_of(policy: Any) -> dict[str, bool]:

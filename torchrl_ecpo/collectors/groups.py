@@ -17,7 +17,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
 from torchrl_ecpo.checks import check_count, check_flag, check_group_size
-from torchrl_ecpo.collectors._base import PlayerCollector
+from torchrl_ecpo.collectors._base import PlayerCollector, check_makers
 from torchrl_ecpo.collectors.rollout import GroupPlayer
 from torchrl_ecpo.collectors.workers import Workers
 from torchrl_ecpo.groups import MASK_KEY, TRAJECTORY_KEY
@@ -101,8 +101,8 @@ class TrajectoryGroupCollector(PlayerCollector):
         storing_device: of the batches. Default: the environment's.
 
     Raises:
-        TypeError: for an argument that does not go with groups, and for an environment that writes
-            anything but tensors.
+        TypeError: for an argument that does not go with groups or is of another class, and for an
+            environment that writes anything but tensors.
         ValueError: if `K` is below 2 or not the environment's, if `G` is no multiple, or if the
             environment makes groups of another size.
         KeyError: if the environment has no `group_key`.
@@ -146,7 +146,7 @@ class TrajectoryGroupCollector(PlayerCollector):
         group_size = check_group_size(group_size)
         check_flag("sync", sync, None)
         if num_collectors is not None:
-            check_count("num_collectors", num_collectors)
+            num_collectors = check_count("num_collectors", num_collectors)
         backend, makers = _find_makers(create_env_fn, backend, num_collectors, sync)
         if backend_options is not None and backend != "ray":
             raise ValueError(f"backend_options are for backend='ray', got them for {backend!r}.")
@@ -190,9 +190,12 @@ def _find_makers(
     create_env_fn: Any, backend: str | None, num_collectors: int | None, sync: bool | None
 ) -> tuple[str, list[Any]]:
     """Return the backend, and what makes the environment of each worker, or is it."""
-    several = isinstance(create_env_fn, Sequence)
+    several = isinstance(create_env_fn, Sequence) and not isinstance(create_env_fn, str)
+    makers = list(create_env_fn) if several else [create_env_fn] * (num_collectors or 1)
+    check_makers(makers, EnvBase)
     has_workers = several or num_collectors is not None
-    backend = backend or ("process" if has_workers else "direct")
+    if backend is None:
+        backend = "process" if has_workers else "direct"
     if backend not in ("direct", "process", "ray"):
         raise ValueError(
             f"backend={backend!r} does not collect groups; 'direct', 'process' and 'ray' do."
@@ -202,7 +205,6 @@ def _find_makers(
             "sync, num_collectors and lists of environment makers are for workers: sync needs "
             "num_collectors, the number of workers."
         )
-    makers = list(create_env_fn) if several else [create_env_fn] * (num_collectors or 1)
     if num_collectors not in (None, len(makers)):
         raise ValueError(
             f"num_collectors={num_collectors} does not match the {len(makers)} environment makers."

@@ -27,7 +27,7 @@ from torchrl.modules import (
     set_exploration_modules_spec_from_env,
 )
 
-from torchrl_ecpo.checks import check_count, check_flag
+from torchrl_ecpo.checks import check_count, check_flag, check_keys, check_kind
 from torchrl_ecpo.collectors.workers import set_training
 from torchrl_ecpo.groups import GROUP_KEY, MASK_KEY, TRAJECTORY_KEY
 from torchrl_ecpo.modules import record_latents
@@ -61,13 +61,18 @@ class GroupPlayer:
         """Make the environment, and the policy if a factory is given."""
         self.num_groups, self.group_size, self.group_key = num_groups, group_size, group_key
         self.compact_obs = check_flag("compact_obs", compact_obs)
-        self.exclude_keys = set(map(unravel_key, exclude_keys))
+        self.exclude_keys = set(check_keys("exclude_keys", exclude_keys) if exclude_keys else ())
         self.max_steps = check_count("max_steps", max_steps)
+        try:
+            set_exploration_type(exploration_type)
+        except ValueError as error:
+            raise ValueError(f"exploration_type: {error}.") from None
         self.exploration_type = exploration_type
         self.policy_device, self.storing_device = policy_device, storing_device
         env = create_env_fn if isinstance(create_env_fn, EnvBase) else create_env_fn()
+        check_kind("What create_env_fn makes", env, EnvBase)
         env = env if env_device is None else env.to(env_device)
-        if max_frames_per_traj:
+        if max_frames_per_traj is not None:
             frames = check_count("max_frames_per_traj", max_frames_per_traj)
             env = TransformedEnv(env, StepCounter(frames), auto_unwrap=False)
         self._check_env(env)
@@ -108,10 +113,10 @@ class GroupPlayer:
                 f"environment plays at a time, {batch.numel() // self.group_size}."
             )
         specs = dict(env.full_observation_spec.items(True, True))
-        if self.group_key not in specs:
+        if self.group_key not in [*specs]:
             raise KeyError(
-                f"The environment has no {self.group_key!r}, the problem instance of each row; it "
-                f"has {sorted(map(str, specs))}. GroupedEnv adds it to any environment."
+                f"The environment has no group_key {self.group_key!r}, the problem instance of "
+                f"each row; it has {sorted(map(str, specs))}. GroupedEnv adds it to any."
             )
         if "done" not in env.done_keys:
             raise KeyError(f"The environment must have one 'done' a row, it has {env.done_keys}.")
@@ -143,9 +148,10 @@ class GroupPlayer:
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on from what :meth:`state_dict` returned."""
+        next_id = check_count("next_id", state_dict["next_id"], least=0)
         for env, state in zip(self._levels(), state_dict["env"], strict=True):
             env.load_state_dict(state)
-        self._next_id = state_dict["next_id"]
+        self._next_id = next_id
         if isinstance(self.policy, nn.Module):
             self.policy.load_state_dict(state_dict["policy"])
 

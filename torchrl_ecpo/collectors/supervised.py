@@ -11,7 +11,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 
-from torchrl_ecpo.collectors._base import PlayerCollector
+from torchrl_ecpo.checks import check_count, check_kind
+from torchrl_ecpo.collectors._base import PlayerCollector, check_makers
 from torchrl_ecpo.collectors.workers import Workers, set_training
 
 __all__ = ["SupervisedAsyncCollector", "SupervisedSyncCollector", "shut_down"]
@@ -41,6 +42,8 @@ class SupervisedSyncCollector(PlayerCollector):
         options: what else ``Collector`` takes.
 
     Raises:
+        TypeError: if `create_env_fn` is no sequence of functions, or `policy` no function.
+        ValueError: for numbers of frames that are none.
         ChildProcessError: if a worker dies.
     """
 
@@ -58,6 +61,10 @@ class SupervisedSyncCollector(PlayerCollector):
     ) -> None:
         """Start the workers; the class describes the arguments."""
         super().__init__(policy, total_frames)
+        frames_per_batch = check_count("frames_per_batch", frames_per_batch)
+        init_random_frames = check_count("init_random_frames", init_random_frames, least=0)
+        check_kind("create_env_fn", create_env_fn, Sequence)
+        check_makers([*create_env_fn])
         num_workers = len(create_env_fn)
         shares = num_workers if self._sync else 1
         self.policy, self.init_random_frames = policy, init_random_frames

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torchrl.envs import EnvBase
 
-from torchrl_ecpo.checks import check_count
+from torchrl_ecpo.checks import check_count, check_kind
 
 _COUNTER_BITS = 24
 _PREFIX_BITS = 63 - _COUNTER_BITS
@@ -40,8 +40,9 @@ class GroupIdAllocator:
         It is a hash of 63 bits: a million of them collide with a probability of one in 20 million.
 
         Args:
-            key: non-negative integers.
+            key: non-negative integers; anything else is a ValueError.
         """
+        key = tuple(check_count("key", part, least=0) for part in key)
         self._renew_elsewhere()
         bits = np.random.SeedSequence(self._prefix, spawn_key=key).generate_state(1, np.uint64)
         return int(bits[0] >> np.uint64(1))
@@ -70,8 +71,7 @@ class GroupIdAllocator:
         Raises:
             ValueError: if one call asks for more ids than the counter holds.
         """
-        check_count("count", count, least=0)
-        check_count("stride", stride)
+        count, stride = check_count("count", count, least=0), check_count("stride", stride)
         span = count * stride
         if span > 1 << _COUNTER_BITS:
             raise ValueError(
@@ -97,6 +97,7 @@ def describe(env: EnvBase) -> str:
 
 def check_owner(state: Mapping[str, Any], own: str) -> None:
     """Refuse the state of another environment; one written before states had an owner is taken."""
+    check_kind("_extra_state", state, Mapping)
     owner = state.get("env", own)
     if owner != own:
         raise ValueError(f"The state is of another environment: of {owner}, and this is {own}.")

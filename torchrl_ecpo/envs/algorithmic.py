@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torchrl.data import Categorical, Composite, MultiCategorical, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_ecpo.checks import check_count, get_entry
+from torchrl_ecpo.checks import check_count, check_kind, described, get_entry
 from torchrl_ecpo.envs._groups import GroupIdAllocator, check_owner
 
 __all__ = ["TASKS", "AlgorithmicEnv", "AlgorithmicTask"]
@@ -263,6 +263,8 @@ class _InstanceQueue(nn.Module):
 
     def set_extra_state(self, state: Tensor) -> None:
         """Put the random generator back to `state`."""
+        if state.shape != self.get_extra_state().shape:
+            raise ValueError(f"_queue._extra_state is no state of a generator: {described(state)}.")
         self.generator.set_state(state.cpu())
 
 
@@ -381,11 +383,11 @@ class AlgorithmicEnv(EnvBase):
         if not isinstance(task, str) or task not in TASKS:
             raise ValueError(f"Unknown task {task!r}: expected one of {', '.join(TASKS)}.")
         self.task_name, self.task = task, TASKS[task]
-        self._check_arguments(num_groups, group_size, min_length, curriculum)
-        batch_size = (num_groups, group_size)
+        self._check_arguments(min_length, curriculum)
+        batch_size = (check_count("num_groups", num_groups), check_count("group_size", group_size))
         super().__init__(batch_size=batch_size, device=device)
         if seed is not None:
-            check_count("seed", seed, least=0)
+            seed = check_count("seed", seed, least=0)
         level = self.task.min_length if min_length is None else min_length
         self.curriculum = _Curriculum(curriculum, batch_size, level, self.task.last, self.device)
         # In gym's curriculum the copies of a draw may differ in level: room for an id a level.
@@ -397,11 +399,7 @@ class AlgorithmicEnv(EnvBase):
         if curriculum == "gym":
             self._start(self._every_row)
 
-    def _check_arguments(
-        self, num_groups: int, group_size: int, min_length: int | None, curriculum: str | None
-    ) -> None:
-        check_count("num_groups", num_groups)
-        check_count("group_size", group_size)
+    def _check_arguments(self, min_length: int | None, curriculum: str | None) -> None:
         lowest = self.task.duplication
         if min_length is not None and not (
             lowest <= check_count("min_length", min_length, least=0) <= _TOP_LEVEL
@@ -426,6 +424,10 @@ class AlgorithmicEnv(EnvBase):
     def _load_from_state_dict(self, state_dict: dict, prefix: str, *args: object) -> None:
         own = self.get_extra_state()
         check_owner(state_dict.setdefault(f"{prefix}_extra_state", own), own["env"])
+        for name, value in self.state_dict(prefix=prefix).items():
+            given = state_dict.get(name, value)
+            if isinstance(value, Tensor) and getattr(given, "dtype", None) != value.dtype:
+                raise ValueError(f"{name!r} must be {value.dtype}, got {described(given)}.")
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def _make_specs(self) -> None:
@@ -553,6 +555,7 @@ class AlgorithmicEnv(EnvBase):
 
     def _check_instance(self, instance: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """The given instances that the copies `rows` play: characters `[n, L, R]`, length `[n]`."""
+        check_kind("instance", instance, Tensor)
         base, height = self.task.base, self.task.rows
         columns = instance.shape[2] if instance.ndim > 2 else 0
         tail = (columns,) if height == 1 else (columns, height)

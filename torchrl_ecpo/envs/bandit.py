@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_ecpo.checks import as_float, check_count, get_entry
+from torchrl_ecpo.checks import as_float, check_count, check_kind, described, get_entry
 from torchrl_ecpo.envs._groups import GroupIdAllocator
 
 __all__ = ["BanditEnv"]
@@ -63,11 +63,11 @@ class BanditEnv(EnvBase):
         group_size: int = 100,
         device: torch.device | str | None = None,
     ) -> None:
-        check_count("num_actions", num_actions)
-        check_count("num_features", num_features)
-        check_count("num_groups", num_groups)
-        check_count("group_size", group_size)
-        check_count("instance_seed", instance_seed, least=0)
+        num_actions = check_count("num_actions", num_actions)
+        num_features = check_count("num_features", num_features)
+        num_groups = check_count("num_groups", num_groups)
+        group_size = check_count("group_size", group_size)
+        instance_seed = check_count("instance_seed", instance_seed, least=0)
         if not 0 <= as_float("exponent", exponent) < float("inf"):
             raise ValueError(f"exponent must be a finite number >= 0, got {exponent!r}.")
         super().__init__(batch_size=torch.Size([num_groups, group_size]), device=device)
@@ -96,12 +96,14 @@ class BanditEnv(EnvBase):
 
     def expected_reward(self, probabilities: Tensor) -> Tensor:
         """Exact expected reward ``[...]`` of action probabilities ``[..., num_actions]``."""
-        if probabilities.shape[-1:] != self.rewards.shape[-1:]:
+        check_kind("probabilities", probabilities, Tensor)
+        of_each = probabilities.shape[-1:] == self.rewards.shape[-1:]
+        if not of_each or not probabilities.is_floating_point():
             raise ValueError(
-                f"probabilities must be [..., {self.rewards.shape[-1]}], one for each action, got "
-                f"the shape {tuple(probabilities.shape)}."
+                f"probabilities must be floating-point numbers [..., {self.rewards.shape[-1]}], "
+                f"one for each action, got {described(probabilities)}."
             )
-        return probabilities @ self.rewards
+        return probabilities @ self.rewards.to(probabilities.dtype)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         return self._output(done=False)

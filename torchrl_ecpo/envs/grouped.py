@@ -14,7 +14,7 @@ from torchrl.data import Unbounded
 from torchrl.data.utils import CloudpickleWrapper
 from torchrl.envs import EnvBase, GymWrapper, ParallelEnv, SerialEnv, TransformedEnv
 
-from torchrl_ecpo.checks import check_count, check_flag, check_group_size
+from torchrl_ecpo.checks import check_count, check_flag, check_group_size, check_real, get_entry
 from torchrl_ecpo.envs._groups import GroupIdAllocator, check_owner, describe
 from torchrl_ecpo.groups import GROUP_KEY
 
@@ -112,7 +112,7 @@ class GroupedEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
-            check_count("seed", seed, least=0)
+            seed = check_count("seed", seed, least=0)
         self._seed = secrets.randbits(63) if seed is None else seed
         self._ids = GroupIdAllocator()  # an instance of another seed is another one
         self._episode = np.zeros(self.batch_size, dtype=int)  # of each copy, the next one
@@ -159,6 +159,8 @@ class GroupedEnv(EnvBase):
                 )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        for key in self.action_keys:
+            check_real(key, get_entry(tensordict, key))
         out = self.copies.step(tensordict.reshape(-1))["next"]
         return out.reshape(self.batch_size).set(GROUP_KEY, self._group.clone())
 
@@ -169,8 +171,11 @@ class GroupedEnv(EnvBase):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Go on with the next instances; the environment must be reset."""
         check_owner(state, describe(self))
-        self._set_seed(state["seed"])
-        self._episode[:] = state["episode"]
+        seed, episode = check_count("seed", state["seed"], least=0), np.asarray(state["episode"])
+        if episode.shape != self._episode.shape or episode.dtype.kind != "i":
+            raise ValueError(f"episode must be integers {list(self.batch_size)}, got {episode}.")
+        self._set_seed(seed)
+        self._episode[:] = episode
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close the copies."""

@@ -10,6 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import DMControlWrapper, GymWrapper, Transform
 
+from torchrl_ecpo.checks import check_flag, check_kind
 from torchrl_ecpo.envs._groups import check_owner, describe
 
 __all__ = ["EpisodeReplay"]
@@ -74,8 +75,15 @@ class EpisodeReplay(Transform):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Play the episode again, up to where it was."""
         check_owner(state, describe(self._task()))
-        self._set_random_state(state["start"])
-        if not state["is_begun"]:
+        is_begun = check_flag("is_begun", state["is_begun"])
+        check_kind("actions", state["actions"], list)
+        for action in state["actions"]:
+            check_kind("Each of actions", action, Tensor)
+        try:
+            self._set_random_state(state["start"])
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise ValueError(f"start is no state of the task's generator: {error}.") from error
+        if not is_begun:
             return
         env = self._task()
         step = env.reset()

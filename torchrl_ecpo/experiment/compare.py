@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from omegaconf import OmegaConf
 
+from torchrl_ecpo.checks import as_float
 from torchrl_ecpo.experiment.figures import plot_comparison, smooth
 from torchrl_ecpo.experiment.run import METRICS_FILE, read_metrics
 
@@ -90,10 +91,11 @@ def load_comparison(
         KeyError: if a run has no such metric or entry.
         ValueError: if a run has no value yet, or the runs of a method do not overlap.
     """
+    smoothing = as_float("smoothing", smoothing)
     curves: dict[str, list[np.ndarray]] = {}
     for run in runs:
         columns = read_metrics(run)
-        if metric not in columns:
+        if metric not in [*columns]:
             raise KeyError(f"{run} has no metric {metric!r}; it has {sorted(columns)}.")
         method = _method(run, by)
         steps, values = np.array(columns["step"]), np.array(columns[metric])

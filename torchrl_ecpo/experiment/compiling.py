@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from torch import nn
 
+from torchrl_ecpo.checks import check_kind
+
 __all__ = ["compile_module"]
 
 
@@ -30,6 +32,7 @@ def compile_module(module: nn.Module, name: str) -> None:
         >>> list(network.state_dict())
         ['weight', 'bias']
     """
+    check_kind("module", module, nn.Module)
     on_gpu = any(parameter.is_cuda for parameter in module.parameters())
     module.compile(options={"fallback_random": True, "triton.cudagraphs": on_gpu})
     print(f"The first call of the {name} compiles it, which may take some minutes", flush=True)

@@ -24,7 +24,7 @@ from torch import Tensor
 from torchrl.record.loggers import Logger, get_logger
 from tqdm import tqdm
 
-from torchrl_ecpo.checks import check_choice
+from torchrl_ecpo.checks import as_float, check_choice
 from torchrl_ecpo.experiment.figures import plot_learning_curve
 
 __all__ = ["METRICS_FILE", "MetricsTable", "Run", "read_metrics"]
@@ -65,12 +65,14 @@ class MetricsTable:
         """Append a row. A new column rewrites the file, with empty cells in earlier rows.
 
         Raises:
-            ValueError: if the step is not beyond that of the row before.
+            ValueError: if the step is not beyond that of the row before, or anything no number.
         """
+        if not math.isfinite(as_float("step", step)):
+            raise ValueError(f"step must be finite, got {step}.")
         if self.rows and not step > self.rows[-1]["step"]:
             raise ValueError(f"step must grow, got {step} after {self.rows[-1]['step']}.")
         self.restore()
-        row = {"step": step, **metrics}
+        row = {"step": step, **{name: as_float(name, value) for name, value in metrics.items()}}
         self.rows.append(row)
         if any(name not in self._columns for name in row):
             self._columns = _columns(self.rows)

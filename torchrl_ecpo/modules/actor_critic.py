@@ -25,7 +25,14 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.modules import ProbabilisticActor, TanhModule, TanhNormal
 
 from torchrl_ecpo._torch import is_transformed
-from torchrl_ecpo.checks import as_float, check_count
+from torchrl_ecpo.checks import (
+    as_float,
+    check_count,
+    check_counts,
+    check_keys,
+    check_kind,
+    names_entries,
+)
 
 __all__ = [
     "DenseNetwork",
@@ -59,8 +66,9 @@ class DenseNetwork(TensorDictModuleBase):
         final_gain: factor of the last layer's parameters at the start. Default: 1.
 
     Raises:
-        ValueError: if a size is no integer of at least 1, or if ``final_gain`` is negative or not
-            finite.
+        TypeError: if keys are no lists of names, or ``head`` is no function.
+        ValueError: if a size is no integer of at least 1, if ``final_gain`` is negative or not
+            finite, and for entries that it cannot read.
 
     Examples:
         >>> import torch
@@ -81,8 +89,15 @@ class DenseNetwork(TensorDictModuleBase):
         super().__init__()
         if not 0 <= as_float("final_gain", final_gain) < math.inf:
             raise ValueError(f"final_gain must be at least 0 and finite, got {final_gain}.")
-        self.in_keys, self.out_keys = list(in_keys), list(out_keys)
-        self.sizes = tuple(check_count("The size of a layer", size) for size in sizes)
+        self.in_keys, self.out_keys = (
+            check_keys("in_keys", in_keys),
+            check_keys("out_keys", out_keys),
+        )
+        self.sizes = check_counts("sizes", sizes)
+        if len(self.sizes) < 2:
+            raise ValueError(f"sizes must be of the inputs and of each layer, got {self.sizes}.")
+        if head is not None:
+            check_kind("head", head, Callable)
         self.head = head
         self.final_gain = final_gain
         self._names = [name for i in range(len(sizes) - 1) for name in (f"weight_{i}", f"bias_{i}")]
@@ -104,12 +119,14 @@ class DenseNetwork(TensorDictModuleBase):
                 getattr(self, name).mul_(self.final_gain)
 
     @dispatch(auto_batch_size=False)
+    @names_entries
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the outputs into ``tensordict``."""
         parameters = [getattr(self, name) for name in self._names]
         inputs = torch.cat([tensordict.get(key) for key in self.in_keys], -1)
         return self._write(_compute([inputs], parameters), tensordict)
 
+    @names_entries
     def each(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
         """The outputs with each of N sets of parameters, on the same inputs.
 
@@ -152,6 +169,8 @@ class DenseNetwork(TensorDictModuleBase):
 
     def _write(self, output: Tensor, tensordict: TensorDictBase) -> TensorDictBase:
         outputs = (output,) if self.head is None else self.head(output)
+        if len(outputs) != len(self.out_keys):
+            raise ValueError(f"The head gives {len(outputs)} outputs for out_keys={self.out_keys}.")
         for key, value in zip(self.out_keys, outputs, strict=True):
             tensordict.set(key, value)
         return tensordict
@@ -228,7 +247,7 @@ def make_tanh_gaussian_actor(
     network: Any = DenseNetwork(
         ["observation"],
         ["loc", "scale"],
-        [observation_size, *hidden_sizes, 2 * spec.shape[-1]],
+        _sizes(observation_size, hidden_sizes, 2 * spec.shape[-1]),
         _loc_and_scale,
         final_gain=final_gain,
     )
@@ -266,7 +285,7 @@ def make_deterministic_actor(
         torch.Size([5, 1])
     """
     spec = _bounded(action_spec)
-    sizes = [observation_size, *hidden_sizes, spec.shape[-1]]
+    sizes = _sizes(observation_size, hidden_sizes, spec.shape[-1])
     network: Any = DenseNetwork(["observation"], ["pre_tanh"], sizes)
     squash: Any = TanhModule(in_keys=["pre_tanh"], out_keys=["action"], spec=spec)
     return TensorDictSequential(network, squash)
@@ -288,9 +307,8 @@ def make_qvalue_network(
         >>> qvalue(observation=torch.zeros(5, 3), action=torch.zeros(5, 2)).shape
         torch.Size([5, 1])
     """
-    inputs = check_count("observation_size", observation_size)
-    inputs += check_count("action_size", action_size)
-    sizes = [inputs, *hidden_sizes, 1]
+    sizes = _sizes(observation_size, hidden_sizes, 1)
+    sizes[0] += check_count("action_size", action_size)
     return DenseNetwork(["observation", "action"], ["state_action_value"], sizes)
 
 
@@ -308,7 +326,13 @@ def make_value_network(
         >>> make_value_network(3)(observation=torch.zeros(5, 3)).shape
         torch.Size([5, 1])
     """
-    return DenseNetwork(["observation"], ["state_value"], [observation_size, *hidden_sizes, 1])
+    sizes = _sizes(observation_size, hidden_sizes, 1)
+    return DenseNetwork(["observation"], ["state_value"], sizes)
+
+
+def _sizes(observation_size: int, hidden_sizes: Sequence[int], num_outputs: int) -> list[int]:
+    size = check_count("observation_size", observation_size)
+    return [size, *check_counts("hidden_sizes", hidden_sizes), num_outputs]
 
 
 def _bounded(action_spec: TensorSpec) -> Any:
@@ -319,7 +343,7 @@ def _bounded(action_spec: TensorSpec) -> Any:
             f"{type(action_spec).__name__}. Discrete actions belong to DiscreteECACLoss, "
             "several or hybrid ones to the losses of groups, such as ECPOLoss."
         )
-    if len(action_spec.shape) != 1:
+    if len(action_spec.shape) != 1 or not action_spec.shape[0]:
         raise ValueError(
             f"action_spec must be of one vector, got the shape {tuple(action_spec.shape)}: take "
             "`env.action_spec_unbatched`."

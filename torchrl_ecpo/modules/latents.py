@@ -16,6 +16,8 @@ from torch import Tensor, nn
 from torch.distributions import Distribution, Independent, TransformedDistribution
 from torch.distributions.transforms import ComposeTransform, TanhTransform
 
+from torchrl_ecpo.checks import check_kind
+
 __all__ = ["record_latents"]
 
 LOST = 1e-4
@@ -34,6 +36,9 @@ def record_latents(policy: nn.Module) -> None:
     Args:
         policy: whose ``ProbabilisticTensorDictModule`` draw the actions; changed in place.
 
+    Raises:
+        TypeError: if it is no module.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -45,6 +50,7 @@ def record_latents(policy: nn.Module) -> None:
         >>> torch.equal(2 * step["action_latent"].tanh(), step["action"])
         True
     """
+    check_kind("policy", policy, nn.Module)
     for module in policy.modules():
         is_head = isinstance(module, ProbabilisticTensorDictModule)
         if is_head and may_squash(module) and not isinstance(module.distribution_class, _Drawn):

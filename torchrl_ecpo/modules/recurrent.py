@@ -16,7 +16,14 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import TensorDictPrimer
 from torchrl.modules import recurrent_mode
 
-from torchrl_ecpo.checks import check_count
+from torchrl_ecpo.checks import (
+    check_count,
+    check_counts,
+    check_keys,
+    check_kind,
+    check_mask,
+    names_entries,
+)
 from torchrl_ecpo.modules.histories import (
     Histories,
     LSTMOverHistories,
@@ -67,8 +74,8 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
 
     Raises:
         KeyError: if `is_init` is missing, or the state of a row that continues.
-        ValueError: if an input is out of range; in recurrent mode without a time dimension, or for
-            a sequence that begins in the middle of a trajectory.
+        ValueError: if an input is out of range or cannot be read; in recurrent mode without a time
+            dimension, or for a sequence that begins in the middle of a trajectory.
 
     Examples:
         >>> import torch
@@ -99,21 +106,23 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
         dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
-        self.num_classes = tuple(check_count("A number of num_classes", n) for n in num_classes)
+        self.num_classes = check_counts("num_classes", num_classes)
         self.num_symbols = prod(self.num_classes)
         if self.num_symbols > 2**31:
             raise ValueError(
                 "num_classes: expected numbers with a product of at most 2^31, got "
                 f"{self.num_classes}."
             )
-        self.input_keys = list(in_keys)
-        all_keys: list[Any] = [*in_keys, *STATE_KEYS, "is_init"]
+        self.input_keys = check_keys("in_keys", in_keys)
+        all_keys: list[Any] = [*self.input_keys, *STATE_KEYS, "is_init"]
         self.in_keys = all_keys
-        out_keys: list[Any] = [out_key, *(("next", key) for key in STATE_KEYS)]
+        out_keys: list[Any] = [*check_keys("out_key", [out_key])]
+        out_keys += [("next", key) for key in STATE_KEYS]
         self.out_keys = out_keys
         self.hidden_size = check_count("hidden_size", hidden_size)
         self.cell = nn.LSTMCell(sum(self.num_classes), self.hidden_size, device=device, dtype=dtype)
         self.readout = readout if readout is not None else nn.Identity()
+        check_kind("readout", self.readout, nn.Module)
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """The transform that lets an environment carry the states from step to step.
@@ -125,6 +134,7 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
         spec = Unbounded(torch.Size((1, self.hidden_size)), dtype=dtype)
         return _TransientPrimer(dict.fromkeys(STATE_KEYS, spec), expand_specs=True)
 
+    @names_entries
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the output; in sampling also the next states.
 
@@ -150,7 +160,9 @@ class DistinctHistoryLSTM(TensorDictModuleBase):
                     "none."
                 )
             mask = tensordict.get(("collector", "mask"), None)
-            starts = starts if mask is None else starts | ~mask
+            if mask is not None:
+                mask = check_mask(("collector", "mask"), mask, shape)
+                starts = starts | ~mask
             symbols, starts, mask = (_time_first(x) for x in (symbols, starts, mask))
             if not starts[0].all():
                 raise ValueError(

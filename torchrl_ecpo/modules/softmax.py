@@ -8,6 +8,8 @@ from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution
 from torchrl.modules import ProbabilisticActor
 
+from torchrl_ecpo.checks import check_kind, described
+
 __all__ = ["LinearSoftmax", "SharedCategorical", "make_softmax_policy"]
 
 
@@ -16,6 +18,10 @@ class LinearSoftmax(nn.Module):
 
     Args:
         features: ``[num_actions, num_features]``, fixed. theta starts at zero: the uniform policy.
+
+    Raises:
+        TypeError: if features are no tensor.
+        ValueError: if they are no matrix of finite numbers.
 
     Examples:
         >>> logits = LinearSoftmax(torch.eye(4))
@@ -27,6 +33,13 @@ class LinearSoftmax(nn.Module):
 
     def __init__(self, features: Tensor) -> None:
         super().__init__()
+        check_kind("features", features, Tensor)
+        is_matrix = features.ndim == 2 and features.numel() and features.is_floating_point()
+        if not is_matrix or not features.isfinite().all():
+            raise ValueError(
+                "features must be finite floating-point numbers [num_actions, num_features], got "
+                f"{described(features)}."
+            )
         self.register_buffer("features", features)
         self.theta = nn.Parameter(features.new_zeros(features.shape[-1]))
 
@@ -47,6 +60,9 @@ class SharedCategorical(Distribution):
     Args:
         logits: ``[..., num_actions]``, all rows equal; only the first one is read.
 
+    Raises:
+        ValueError: if logits are no floating-point numbers, or actions no integers.
+
     Examples:
         >>> dist = SharedCategorical(logits=torch.zeros(4).expand(2, 3, 4))
         >>> dist.sample().shape, dist.log_prob(torch.zeros(2, 3, dtype=torch.int64)).exp()[0, 0]
@@ -56,6 +72,12 @@ class SharedCategorical(Distribution):
     arg_constraints: dict = {}  # noqa: RUF012 - torch declares it so
 
     def __init__(self, logits: Tensor) -> None:
+        check_kind("logits", logits, Tensor)
+        if not logits.is_floating_point() or not logits.numel() or not logits.ndim:
+            raise ValueError(
+                "logits must be floating-point numbers [..., num_actions], got "
+                f"{described(logits)}."
+            )
         batch_shape = logits.shape[:-1]
         super().__init__(batch_shape, validate_args=False)
         self.row = Categorical(logits=logits[(0,) * len(batch_shape)], validate_args=False)
@@ -66,6 +88,8 @@ class SharedCategorical(Distribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-probability ``[...]`` of actions ``[...]``."""
+        if not isinstance(value, Tensor) or value.dtype not in (torch.int64, torch.int32):
+            raise ValueError(f"value must be actions, of torch.int64, got {described(value)}.")
         return self.row.log_prob(value)
 
     def entropy(self) -> Tensor:

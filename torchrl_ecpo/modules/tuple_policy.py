@@ -15,17 +15,21 @@ from torch.nn import functional as F
 from torchrl.envs import ExplorationType, exploration_type
 from torchrl.modules import LSTMModule, ProbabilisticActor
 
-from torchrl_ecpo.checks import check_count, check_flag
+from torchrl_ecpo.checks import check_count, check_counts, check_flag, check_kind, described
 from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
 
 __all__ = ["TupleCategorical", "make_tuple_policy"]
 
 
 def _num_logits(nvec: Sequence[int]) -> int:
-    if len(nvec) != 3 or nvec[1] != 2 or min(nvec) < 1:
+    try:
+        is_nvec = len(nvec) == 3 and nvec[1] == 2 and min(nvec) >= 1
+    except TypeError:
+        is_nvec = False
+    if not is_nvec:
         raise ValueError(
             "nvec: expected (moves, 2, characters), the sizes of move, write flag and "
-            f"character, got {tuple(nvec)}."
+            f"character, got {nvec!r}."
         )
     return sum(nvec)
 
@@ -47,7 +51,7 @@ class TupleCategorical(Distribution):
 
     Raises:
         ValueError: if nvec is not of the form (moves, 2, characters), L is another size, or a logit
-            is NaN.
+            is NaN or infinity (-infinity: what is never taken).
 
     Examples:
         >>> import torch
@@ -65,13 +69,16 @@ class TupleCategorical(Distribution):
 
     def __init__(self, logits: Tensor, nvec: Sequence[int], validate_args: bool = True) -> None:
         size = _num_logits(nvec)
-        if logits.shape[-1:] != (size,):
+        check_kind("logits", logits, Tensor)
+        if logits.shape[-1:] != (size,) or not logits.is_floating_point():
             raise ValueError(
-                f"logits: expected a last dimension of {size} for nvec={tuple(nvec)}, got shape "
-                f"{tuple(logits.shape)}."
+                f"logits: expected floating-point numbers, the last dimension {size} for "
+                f"nvec={tuple(nvec)}, got {described(logits)}."
             )
-        if validate_args and logits.isnan().any():
-            raise ValueError("logits: expected numbers, got NaN; the network's weights may be NaN.")
+        if check_flag("validate_args", validate_args) and not (logits < torch.inf).all():
+            raise ValueError(
+                "logits: expected numbers, got NaN or infinity; the network's weights may be NaN."
+            )
         self.nvec, self.logits = tuple(nvec), logits
         # The base class would check the same constraint, at several times the cost.
         super().__init__(logits.shape[:-1], torch.Size([3]), validate_args=False)
@@ -149,7 +156,13 @@ class TupleCategorical(Distribution):
         """Log-probability of actions within range."""
         index, log_probs = value, self._log_probs
         if index.shape[:-1] != self.batch_shape:
-            shape = torch.broadcast_shapes(index.shape[:-1], self.batch_shape)
+            try:
+                shape = torch.broadcast_shapes(index.shape[:-1], self.batch_shape)
+            except RuntimeError:
+                raise ValueError(
+                    f"action: expected the batch shape {tuple(self.batch_shape)} of the logits, "
+                    f"got {tuple(index.shape[:-1])}."
+                ) from None
             log_probs = log_probs.expand(*shape, *log_probs.shape[-2:])
             index = index.expand(*shape, -1)
         move, write, character = log_probs.gather(-1, index.unsqueeze(-1)).squeeze(-1).unbind(-1)
@@ -181,10 +194,11 @@ class TupleCategorical(Distribution):
         return values.unflatten(-1, (3, width))
 
     def _check_range(self, action: Tensor) -> None:
-        if action.shape[-1:] != (3,):
+        check_kind("action", action, Tensor)
+        if action.shape[-1:] != (3,) or action.dtype not in (torch.int64, torch.int32):
             raise ValueError(
-                f"action: expected a last dimension of 3 (move, write, character), got shape "
-                f"{tuple(action.shape)}."
+                "action: expected int64, the last dimension 3 (move, write, character), got "
+                f"{described(action)}."
             )
         if ((action < 0) | (action >= action.new_tensor(self.nvec))).any():
             flat = action.reshape(-1, 3)
@@ -250,6 +264,7 @@ def make_tuple_policy(
     """
     num_observations = check_count("num_observations", num_observations)
     hidden_size = check_count("hidden_size", hidden_size)
+    nvec = check_counts("nvec", nvec)
     num_classes = [num_observations, *(n + 1 for n in nvec)]
     inputs: list[NestedKey] = ["observation", "previous_action"]
     factory: dict[str, Any] = {"device": device, "dtype": dtype}
@@ -276,7 +291,7 @@ def make_tuple_policy(
         core,
         in_keys=["logits"],
         distribution_class=TupleCategorical,
-        distribution_kwargs={"nvec": tuple(nvec)},
+        distribution_kwargs={"nvec": nvec},
         default_interaction_type=ExplorationType.RANDOM,
         return_log_prob=True,
         log_prob_key="action_log_prob",
