@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase, is_non_tensor
+from tensordict import TensorDictBase, is_non_tensor, is_tensor_collection
 from tensordict.utils import NestedKey
 from torch import Tensor
 
@@ -102,7 +102,7 @@ def get_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
             f"The entry {key!r} is missing; there are {present(tensordict)}. If it has another "
             "name, say so with set_keys(...), or where the networks are built."
         )
-    if not isinstance(value, (Tensor, TensorDictBase)) or is_non_tensor(value):
+    if is_non_tensor(value) or not (isinstance(value, Tensor) or is_tensor_collection(value)):
         raise TypeError(f"The entry {key!r} must be a tensor, got {type(value).__name__}.")
     return value
 
