@@ -9,7 +9,7 @@ from tensordict import TensorDict, tensorclass
 from torchrl.envs import GymEnv
 
 from torchrl_ecpo import ECPOLoss, PMDLoss, TrajectoryGroupCollector
-from torchrl_ecpo.checks import check_count, check_flag, get_entry
+from torchrl_ecpo.checks import check_count, check_flag, get_entry, unreadable
 from torchrl_ecpo.envs import BanditEnv
 from torchrl_ecpo.envs.algorithmic import AlgorithmicEnv
 from torchrl_ecpo.envs.grouped import GroupedEnv
@@ -79,6 +79,12 @@ def test_entries_are_tensors_or_collections_of_them():
     assert isinstance(get_entry(entries, "graph"), _Graph)
     with pytest.raises(TypeError, match="'text' must be a tensor, got "):
         get_entry(entries, "text")
+
+
+def test_errors_without_a_message_have_a_name():
+    """As that of a distribution without log_prob."""
+    error = unreadable("actor", TensorDict(), ["action"], NotImplementedError())
+    assert str(error) == "The actor cannot be evaluated on 'action' (missing): NotImplementedError"
 
 
 @pytest.mark.parametrize(("name", "make"), _cases(COUNTS))

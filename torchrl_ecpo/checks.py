@@ -126,7 +126,7 @@ def unreadable(
             told.append(f"{key!r} {value.dtype} {tuple(value.shape)}")
         else:
             told.append(f"{key!r} ({type(value).__name__})")
-    reason = str(error).strip().splitlines()[0]
+    reason = (str(error).strip() or type(error).__name__).splitlines()[0]
     kind = KeyError if isinstance(error, KeyError) else ValueError
     return kind(f"The {network} cannot be evaluated on {', '.join(told)}: {reason}")
 

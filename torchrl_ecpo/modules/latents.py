@@ -126,7 +126,8 @@ def split(distribution: Any) -> tuple[Distribution, list[Any]]:
 def invert(distribution: Distribution, action: Tensor) -> Tensor:
     """A latent of an action: one of many if it is rounded to the end of its range, NaN outside."""
     for transform in reversed(list(_each(split(distribution)[1]))):
-        if isinstance(transform, TanhTransform):
+        is_tanh = isinstance(transform, TanhTransform)
+        if is_tanh:
             eps = torch.finfo(action.dtype).eps
             inside = action.clamp(-1 + eps, 1 - eps)
             action = inside.where(action.abs() <= 1 + 8 * eps, torch.nan)
@@ -155,7 +156,8 @@ def log_prob_of_latent(distribution: Distribution, latent: Tensor) -> Tensor:
         before, latent = latent, transform(latent)
         ndim = len(distribution.event_shape) - transform.domain.event_dim
         terms.append(-_sum_last(transform.log_abs_det_jacobian(before, latent), ndim))
-    return sum(reversed(terms))
+    total: Any = sum(reversed(terms))
+    return total
 
 
 def _sum_last(values: Tensor, ndim: int) -> Tensor:
