@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict, tensorclass
 from torchrl.envs import GymEnv
 
 from torchrl_ecpo import ECPOLoss, PMDLoss, TrajectoryGroupCollector
-from torchrl_ecpo.checks import check_count, check_flag
+from torchrl_ecpo.checks import check_count, check_flag, get_entry, unreadable
 from torchrl_ecpo.envs import BanditEnv
 from torchrl_ecpo.envs.algorithmic import AlgorithmicEnv
 from torchrl_ecpo.envs.grouped import GroupedEnv
@@ -65,6 +66,25 @@ def _cases(table):
 def test_integers_of_numpy_are_integers(value):
     count = check_count("n", value)
     assert (count, type(count)) == (3, int)
+
+
+@tensorclass
+class _Graph:
+    nodes: torch.Tensor
+
+
+def test_entries_are_tensors_or_collections_of_them():
+    graph = _Graph(torch.zeros(2), batch_size=[2])
+    entries = TensorDict({"graph": graph, "text": "north"}, [2])
+    assert isinstance(get_entry(entries, "graph"), _Graph)
+    with pytest.raises(TypeError, match="'text' must be a tensor, got "):
+        get_entry(entries, "text")
+
+
+def test_errors_without_a_message_have_a_name():
+    """As that of a distribution without log_prob."""
+    error = unreadable("actor", TensorDict(), ["action"], NotImplementedError())
+    assert str(error) == "The actor cannot be evaluated on 'action' (missing): NotImplementedError"
 
 
 @pytest.mark.parametrize(("name", "make"), _cases(COUNTS))

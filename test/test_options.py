@@ -128,7 +128,8 @@ def test_hydra_s_own_refusals_stand():
         ("seed=0,1 loss.tau=0.1,fast --multirun", "ecpo.py: loss.tau must be .* got 'fast'"),
         ("-m loss=ecpo,pmd loss.control_variate=true", "no option loss.control_variate"),
         ("-cn config env=chess", "Could not find 'env/chess'"),
-        ("seed=1,2 --multirun", "ecpo.py: seed 2 is refused"),
+        ("--multirun seed=1,2", "ecpo.py: seed 2 is refused"),
+        ("--multirun loss=glob(p*) seed=2", "ecpo.py: loss pmd is refused"),
     ],
 )
 def test_all_runs_of_a_command_line_are_checked(monkeypatch, options, message):
@@ -139,6 +140,15 @@ def test_all_runs_of_a_command_line_are_checked(monkeypatch, options, message):
     monkeypatch.setattr(sys, "argv", ["ecpo.py", *options.split()])
     with pytest.raises(SystemExit, match=message):
         check_command_line(str(SCRIPTS / "ecpo/ecpo.py"), check)
+
+
+@pytest.mark.parametrize(
+    "options", ["--cfg job env=chess", "-c job", "-p optim", "--info searchpath", "-cp config"]
+)
+def test_hydra_s_own_flags_are_its_own(monkeypatch, options):
+    """What is only shown is not checked."""
+    monkeypatch.setattr(sys, "argv", ["ecpo.py", *options.split()])
+    check_command_line(str(SCRIPTS / "ecpo/ecpo.py"), lambda config, given: None)
 
 
 @pytest.mark.parametrize(

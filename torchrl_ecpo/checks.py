@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase, is_non_tensor
+from tensordict import TensorDictBase, is_non_tensor, is_tensor_collection
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
@@ -130,7 +130,7 @@ def get_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
             f"The entry {key!r} is missing; there are {present(tensordict)}. If it has another "
             "name, say so with set_keys(...), or where the networks are built."
         )
-    if not isinstance(value, (Tensor, TensorDictBase)) or is_non_tensor(value):
+    if is_non_tensor(value) or not (isinstance(value, Tensor) or is_tensor_collection(value)):
         raise TypeError(f"The entry {key!r} must be a tensor, got {type(value).__name__}.")
     return value
 
@@ -147,7 +147,7 @@ def unreadable(
         raise error
     values = {key: tensordict.get(key, None) for key in keys}
     told = [f"{key!r} {'(missing)' if x is None else described(x)}" for key, x in values.items()]
-    reason = str(error).strip().splitlines()[0]
+    reason = (str(error).strip() or type(error).__name__).splitlines()[0]
     kind = KeyError if isinstance(error, KeyError) else ValueError
     return kind(f"The {network} cannot be evaluated on {', '.join(told)}: {reason}")
 

@@ -13,6 +13,7 @@ from tensordict.nn import (
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
     TensorDictModule,
+    set_composite_lp_aggregate,
 )
 from torch import nn
 from torch.distributions import (
@@ -47,6 +48,9 @@ def _nested(loc, scale):
 DISTRIBUTIONS = {
     "torchrl": TanhNormal,
     "torchrl, bounded": lambda loc, scale: TanhNormal(loc, scale, low=-2.0, high=3.0),
+    "torchrl, bounds in single": lambda loc, scale: TanhNormal(
+        loc, scale, low=torch.zeros(A), high=torch.ones(A)
+    ),
     "torch": _of_torch(TanhTransform()),
     "torch, cached": _of_torch(TanhTransform(cache_size=1)),
     "torch, two": _of_torch(TanhTransform(), AffineTransform(0.5, 2.5)),
@@ -121,34 +125,38 @@ def test_gradients_are_those_of_the_latent_gaussian(name, loc, log_scale):
     assert_close(dict(actor.named_parameters())["module.0.module.p"].grad, p.grad)
 
 
+@set_composite_lp_aggregate(True)
 def test_a_composite_action_has_latents_of_its_own():
     """Each squashed part at the key of its action; with parameters alone, the ratio is 1 too."""
+    parts = {"force": TanhNormal, "gain": Normal}
     actor = ProbabilisticTensorDictSequential(
-        TensorDictModule(
-            Head(8.0, 0.0, torch.float32),
-            ["observation"],
-            [("params", "force", "loc"), ("params", "force", "scale")],
+        *(
+            TensorDictModule(
+                Head(8.0, 0.0, torch.float32),
+                ["observation"],
+                [("params", part, "loc"), ("params", part, "scale")],
+            )
+            for part in parts
         ),
         ProbabilisticTensorDictModule(
             in_keys=["params"],
-            out_keys=[("agent", "force")],
+            out_keys=[("agent", "force"), "gain"],
             distribution_class=CompositeDistribution,
             distribution_kwargs={
-                "distribution_map": {"force": TanhNormal},
-                "name_map": {"force": ("agent", "force")},
+                "distribution_map": parts,
+                "name_map": {"force": ("agent", "force"), "gain": "gain"},
             },
             return_log_prob=True,
         ),
     )
-    keys = {"action": ("agent", "force"), "sample_log_prob": ("agent", "force_log_prob")}
     for latents in (False, True):
         if latents:
             record_latents(actor)
         batch = draw(actor)
         assert (("agent", "force_latent") in batch.keys(True)) is latents
         loss = ECPOLoss(actor)
-        loss.set_keys(**keys)
-        assert loss.in_keys[-1] == ("agent", "force_latent")
+        loss.set_keys(action=[("agent", "force"), "gain"])
+        assert loss.in_keys[-2] == ("agent", "force_latent")
         batch = batch.exclude("params") if latents else batch
         assert loss(batch)["kl_reference_policy"].item() == pytest.approx(0, abs=1e-4)
 

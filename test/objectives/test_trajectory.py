@@ -86,9 +86,10 @@ def test_group_shapes_and_missing_trajectories(case, shape, masked):
 
 
 def test_missing_first_trajectory_of_a_recurrent_actor():
-    """The steps that a trajectory without any borrows do not disturb the others."""
+    """The steps that a trajectory without any borrows do not disturb the others, nor its id."""
     loss, actor, batch = problem(ECPO, "lstm", padded=False)
     batch = pad(batch, masked=(0, 3))
+    batch["group"] = 7 * batch[MASK].long()
     assert_same(loss, actor, batch, expected_losses(ECPO, actor, batch))
 
 
@@ -614,7 +615,7 @@ BAD_BATCHES = {
     ),
     "rows of two groups": (
         *(_set("group", torch.arange(3).expand(2, 3).unsqueeze(-1).expand(2, 3, 4)), ValueError),
-        r"4 rows of the batch.* are of another group \('group'\) than the first",
+        r"4 rows of the batch.* are of another group \('group'\) than others",
     ),
     "one-step rows of two groups": (
         lambda b: b[..., -1:].set("group", torch.arange(3).expand(2, 3).unsqueeze(-1)),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
 import operator
@@ -18,6 +17,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
+from hydra.main import get_args_parser  # pyright: ignore[reportPrivateImportUsage]
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -40,23 +40,29 @@ def check_command_line(script: str, check: Callable[[DictConfig, Sequence[str]],
     Raises:
         SystemExit: naming the option, what was expected, and what came.
     """
-    parser = argparse.ArgumentParser(add_help=False)
-    for short, long in (("-cn", "--config-name"), ("-cd", "--config-dir"), ("-sc", "--shell")):
-        parser.add_argument(short, long)
-    flags, given = parser.parse_known_args()
-    options = [option for option in given if not option.startswith("-")]
+    flags = get_args_parser().parse_args()
+    if any((flags.help, flags.hydra_help, flags.cfg, flags.info, flags.shell_completion)):
+        return  # nothing is run
+    options, folder = flags.overrides, Path(script).resolve().parent
     if flags.config_dir:
         options.append(f"hydra.searchpath=['{Path(flags.config_dir).absolute()}']")
     try:
-        for run in expand(options) if flags.shell is None else ():
-            check(compose_options(Path(script).parent, run, flags.config_name or "config"), run)
+        with _initialized(folder / (flags.config_path or "config")):
+            for run in expand(options):
+                check(compose_options(folder, run, flags.config_name or "config"), run)
     except (ValueError, HydraException, OmegaConfBaseException) as error:
         raise SystemExit(f"{Path(script).name}: {error}") from None
 
 
+def _initialized(config: Path) -> Any:
+    return initialize_config_dir(str(config), version_base="1.3")
+
+
 def parse(options: Sequence[str]) -> list[Override]:
     """What hydra reads in a command line."""
-    return OverridesParser.create().parse_overrides(list(options))
+    running = GlobalHydra.instance()
+    loader = running.config_loader() if running.is_initialized() else None
+    return OverridesParser.create(loader).parse_overrides(list(options))
 
 
 def expand(options: Sequence[str]) -> list[list[str]]:
@@ -93,11 +99,7 @@ def compose_options(folder: Path, options: Sequence[str], name: str = "config") 
     file = folder.resolve() / "options.yaml"
     kinds: Any = OmegaConf.to_container(OmegaConf.load(file)) if file.is_file() else {}
     is_running = GlobalHydra.instance().is_initialized()  # within hydra.main
-    with (
-        nullcontext()
-        if is_running
-        else initialize_config_dir(str(file.parent / "config"), version_base="1.3")
-    ):
+    with nullcontext() if is_running else _initialized(file.parent / "config"):
         groups = GlobalHydra.instance().config_loader().list_groups("")
         chosen, values = [], []
         for own in parse(options):

@@ -6,7 +6,7 @@ told from it. Here ``*B`` is the batch shape of a distribution.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import torch
@@ -131,7 +131,7 @@ def split(distribution: Any) -> tuple[Distribution, list[Any]]:
 
 def invert(distribution: Distribution, action: Tensor) -> Tensor:
     """A latent of an action: one of many if it is rounded to the end of its range, NaN outside."""
-    for transform in _each(reversed(split(distribution)[1])):
+    for transform in reversed(list(_each(split(distribution)[1]))):
         is_tanh = isinstance(transform, TanhTransform)
         if is_tanh:
             eps = torch.finfo(action.dtype).eps
@@ -141,22 +141,13 @@ def invert(distribution: Distribution, action: Tensor) -> Tensor:
     return action
 
 
-def _each(transforms: Iterator[Any]) -> Iterator[Any]:
-    """Every single one, from the last to the first."""
+def _each(transforms: list[Any]) -> Iterator[Any]:
+    """Every single one."""
     for transform in transforms:
         if isinstance(transform, ComposeTransform):
-            yield from _each(reversed(transform.parts))
+            yield from _each(transform.parts)
         else:
             yield transform
-
-
-def _log_slopes(transforms: list[Any], latent: Tensor) -> list[tuple[Any, Tensor]]:
-    """Each transform, and the logarithm of its slope on the way from a latent to its action."""
-    slopes = []
-    for transform in transforms:
-        before, latent = latent, transform(latent)
-        slopes.append((transform, transform.log_abs_det_jacobian(before, latent)))
-    return slopes
 
 
 def log_prob_of_latent(distribution: Distribution, latent: Tensor) -> Tensor:
@@ -166,21 +157,26 @@ def log_prob_of_latent(distribution: Distribution, latent: Tensor) -> Tensor:
         of_each = log_prob_of_latent(distribution.base_dist, latent)
         return _sum_last(of_each, distribution.reinterpreted_batch_ndims)
     base, transforms = split(distribution)
-    log_prob: Any = 0.0
-    for transform, slope in reversed(_log_slopes(transforms, latent)):
+    terms: list[Any] = [base.log_prob(latent)]
+    for transform in transforms:
+        before, latent = latent, transform(latent)
         ndim = len(distribution.event_shape) - transform.domain.event_dim
-        log_prob = log_prob - _sum_last(slope, ndim)
-    return log_prob + base.log_prob(latent)
+        terms.append(-_sum_last(transform.log_abs_det_jacobian(before, latent), ndim))
+    total: Any = sum(reversed(terms))
+    return total
 
 
 def _sum_last(values: Tensor, ndim: int) -> Tensor:
     return values.flatten(-ndim).sum(-1) if ndim else values
 
 
-def is_lost(distribution: Distribution, action: Tensor) -> Tensor:
-    """Whether ``[*B]`` the rounding of an action leaves its latent open by more than LOST."""
-    slopes = _log_slopes(split(distribution)[1], invert(distribution, action))
-    shape = (*distribution.batch_shape, -1)
-    slope = sum(slope for _, slope in slopes).reshape(shape).amin(-1).exp()  # pyright: ignore
-    rounding = torch.finfo(action.dtype).eps * action.abs().reshape(shape).amax(-1)
-    return rounding > LOST * slope
+def is_lost(distribution: Distribution, action: Tensor, parameters: Iterable[Tensor]) -> Tensor:
+    """Whether ``[*B]`` rounding, in the coarsest of these types, leaves a latent open by LOST."""
+    eps = max(torch.finfo(x.dtype).eps for x in (action, *parameters) if x.is_floating_point())
+    latent, shape = invert(distribution, action), (*distribution.batch_shape, -1)
+    log_slope, error = torch.zeros_like(latent).reshape(shape), 0.0
+    for transform in _each(split(distribution)[1]):
+        before, latent = latent, transform(latent)
+        log_slope = log_slope + transform.log_abs_det_jacobian(before, latent).reshape(shape)
+        error = error + eps * latent.abs().reshape(shape) / log_slope.exp()
+    return torch.as_tensor(error > LOST).any(-1)

@@ -292,14 +292,12 @@ class ActorCriticLoss(PolicyLoss):
         """
         transitions, mask = self._read(tensordict)
         weights = self._priority_weights(transitions, mask)
-        if not values_can_be_seen():
+        try:
             outputs, td_error = self._outputs(transitions, mask, weights)
-        else:
-            try:
-                outputs, td_error = self._outputs(transitions, mask, weights)
-            except (*UNREADABLE, ValueError) as error:
+        except (*UNREADABLE, ValueError) as error:
+            if values_can_be_seen():
                 self._explain(error, transitions)
-                raise
+            raise
         priority = td_error if mask is None else td_error.where(mask, 0.0)
         key = self.tensor_keys.priority
         if not tensordict.is_locked:

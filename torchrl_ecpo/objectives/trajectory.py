@@ -418,23 +418,18 @@ class TrajectoryGroupLoss(PolicyLoss):
         dist: Any, inputs: TensorDictBase, action_keys: list[NestedKey]
     ) -> Tensor:
         """Log-probability ``[N, T]`` of recorded actions, under one distribution."""
-        parts = parts_of(dist, action_keys)
         is_composite = isinstance(dist, CompositeDistribution)
         if len(action_keys) > 1 and not is_composite:
             raise ValueError(
                 f"The action has several parts {action_keys}, but the actor's distribution is a "
                 f"{type(dist).__name__}, which has one. Name it with set_keys(action=...)."
             )
-        for key, part in parts:
-            action = get_entry(inputs, key)
-            check_real(key, action)
-            if isinstance(part, Categorical) and action.shape == part.batch_shape:
-                check_integers(key, action)
-        if any(split(part)[1] for _, part in parts):
-            log_prob: Any = sum(_log_prob_of_part(part, inputs, key) for key, part in parts)
-        else:
-            action = inputs.select(*action_keys) if is_composite else inputs.get(action_keys[0])
-            log_prob = _sum_parts(dist.log_prob(action))
+        log_prob: Any = 0.0
+        for key, part in parts_of(dist, action_keys):
+            of_part = _log_prob_of_part(part, inputs, key)
+            if is_composite and of_part.ndim > inputs.ndim:
+                of_part = of_part.flatten(inputs.ndim).sum(-1)
+            log_prob = log_prob + of_part
         if log_prob.shape != inputs.shape:
             raise ValueError(
                 f"The actor's distribution {type(dist).__name__} gives log-probabilities of shape "
@@ -468,7 +463,9 @@ class TrajectoryGroupLoss(PolicyLoss):
 
         It is computed from recorded parameters of the distribution, if they are there.
         """
-        if any(inputs.get(key, None) is None for head in self._heads for key in head.in_keys):
+        given = [key for head in self._heads for key in head.in_keys]
+        is_known = all(inputs.get(key, None) is not None for key in self._latent_keys)
+        if is_known or any(inputs.get(key, None) is None for key in given):
             return recorded
         log_prob: Any = 0.0
         lost = torch.zeros(inputs.shape, dtype=torch.bool, device=recorded.device)
@@ -477,10 +474,11 @@ class TrajectoryGroupLoss(PolicyLoss):
                 several = len(self._heads) > 1
                 keys = head.dist_sample_keys if several else _as_list(self.tensor_keys.action)
                 dist = head.get_dist(inputs)
+                parameters = [*inputs.select(*head.in_keys).values(True, True)]
                 log_prob = log_prob + self._log_prob_of_action(dist, inputs, keys)
                 for key, part in parts_of(dist, keys):
                     if split(part)[1] and inputs.get(latent_key(key), None) is None:
-                        lost = lost | is_lost(part, inputs.get(key))
+                        lost = lost | is_lost(part, inputs.get(key), parameters)
         lost, log_prob = lost.reshape(recorded.shape), log_prob.reshape(recorded.shape)
         return log_prob.to(recorded.dtype).where(lost, recorded)
 
@@ -496,8 +494,9 @@ class TrajectoryGroupLoss(PolicyLoss):
             faults[f"go on after an end ({DONE_KEY!r})"] = done[..., :-1] & real[..., 1:]
         if group is not None and group.numel() == real.numel():
             group = group.reshape(real.shape)
-            other = (group != group[..., :1, :1]) & real
-            faults[f"are of another group ({GROUP_KEY!r}) than the first"] = other
+            first = group.where(real, group.max()).amin((-2, -1), keepdim=True)
+            other = (group != first) & real
+            faults[f"are of another group ({GROUP_KEY!r}) than others"] = other
         if not faults or not torch.stack([where.any() for where in faults.values()]).any():
             return False
         fault, where = next((f, where) for f, where in faults.items() if where.any())
@@ -560,10 +559,14 @@ class LiftProjectLoss(TrajectoryGroupLoss):
 
 
 def _log_prob_of_part(distribution: Any, inputs: TensorDictBase, key: NestedKey) -> Tensor:
-    """At the latent of a squashed action, recorded or not."""
-    action, latent = get_entry(inputs, key), inputs.get(latent_key(key), None)
+    """Of an action, a squashed one at its latent, recorded or not."""
+    action = get_entry(inputs, key)
+    check_real(key, action)
+    if isinstance(distribution, Categorical) and action.shape == distribution.batch_shape:
+        check_integers(key, action)
     if not split(distribution)[1]:
         return distribution.log_prob(action)
+    latent = inputs.get(latent_key(key), None)
     return log_prob_of_latent(
         distribution, invert(distribution, action) if latent is None else latent
     )
