@@ -40,9 +40,13 @@ nitpicky = True
 nitpick_ignore_regex = [
     (
         "py:.*",
-        r"(collections|matplotlib|numpy|omegaconf|pathlib|tensordict|torch|torchrl|types|typing)\..*",
+        r"(collections|hydra|matplotlib|numpy|omegaconf|pathlib|tensordict|torch|torchrl|types|typing)"
+        r"\..*",
     ),
-    ("py:(class|exc)", "Actions|Axes|CheckpointError|EnvBase|NestedKey|Tensor|TensorDictBase"),
+    (
+        "py:(class|exc)",
+        "Actions|Axes|CheckpointError|EnvBase|HydraException|NestedKey|Tensor|TensorDictBase",
+    ),
     ("py:class", r"torchrl_ecpo\..*\._.+"),  # what is private has no page
     ("py:class", r"torchrl_ecpo\.modules\.histories\..+"),  # nor has the search for histories
     ("py:attr", "in_keys|loss_mask_key|losses|metrics|out_keys"),  # of every loss
