@@ -1016,9 +1016,8 @@ def leave_one_out(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = 
         tensor([-1.,  1.,  0.])
     """
     distance = centred(score, sample_dim=sample_dim, mask=mask)
-    if mask is None:
-        mask = torch.ones_like(distance, dtype=torch.bool)
-    size = mask.sum(sample_dim, keepdim=True, dtype=distance.dtype)
+    real = torch.ones_like(distance) if mask is None else mask.expand_as(distance)
+    size = real.sum(sample_dim, keepdim=True, dtype=distance.dtype)
     return distance * size / (size - 1).clamp_min(1)
 
 
