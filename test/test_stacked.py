@@ -144,7 +144,7 @@ def test_methods_and_settings_are_stacked(tmp_path, train, task):
     assert len(list((tmp_path / "stack").glob("run_*"))) == len(RUNS[task])
 
 
-STACK = "stack=['loss=ecpo seed=1','loss=urex seed=2 project_steps=1']"
+STACK = "stack=['loss=ecpo seed=1','loss=reps seed=2 project_steps=1']"
 
 
 @pytest.mark.parametrize("options", [(*BANDIT, "seeds=[1,2]"), (*COPY, STACK)])

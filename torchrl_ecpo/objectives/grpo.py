@@ -41,7 +41,7 @@ class GRPOLoss(TrajectoryGroupLoss):
         actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.
 
     Keyword Args:
-        clip_epsilon: epsilon, or (epsilon_low, epsilon_high). Defaults to 0.2 (DeepSeekMath).
+        clip_epsilon: epsilon, or (epsilon_low, epsilon_high). Defaults to 0.2 (PPO).
         score: A: ``"group"`` (default), returns standardised within their group, or ``"return"``,
             less their mean only.
         aggregation: ``"prompt_mean"`` (default), the mean over a trajectory's steps, c = 1;
