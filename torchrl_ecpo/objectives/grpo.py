@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
@@ -86,7 +86,7 @@ class GRPOLoss(TrajectoryGroupLoss):
             reduction=reduction,
         )
         is_pair = isinstance(clip_epsilon, Sequence) and len(clip_epsilon) == 2
-        pair = clip_epsilon if is_pair else (clip_epsilon, clip_epsilon)
+        pair: Any = clip_epsilon if is_pair else (clip_epsilon, clip_epsilon)
         self.clip_low, self.clip_high = (as_float("clip_epsilon", each) for each in pair)
         if not (0 <= self.clip_low < 1 and 0 <= self.clip_high < math.inf):
             raise ValueError(f"clip_epsilon must be >= 0, and < 1 downwards, got {clip_epsilon}.")

@@ -83,6 +83,7 @@ class REPSLoss(ECPOLoss):
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
         """ECPO's, at the temperature that has been found."""
         projection = super().surrogate(groups)
+        assert projection.weights is not None
         log_base = groups.reference_log_prob - groups.behaviour_log_prob
         divergence = lift_divergence_estimate(
             projection.weights,
