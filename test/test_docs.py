@@ -47,6 +47,7 @@ STATED_FOR = {
     "MuJoCo tasks": (ECAC_CONFIG, MUJOCO_TASKS),
     "all but Humanoid-v5": (ECAC_CONFIG, MUJOCO_TASKS[:-1]),
     "Humanoid-v5": (ECAC_CONFIG, MUJOCO_TASKS[-1:]),
+    **dict.fromkeys(("GRPO", "RLOO", "TPO", "Squared-PMD", "REPS"), (ECPO_CONFIG, ("copy",))),
     **dict.fromkeys(("PMD-AC", "SAC", "TD3", "DDPG"), (ECAC_CONFIG, MUJOCO_TASKS)),
 }
 

@@ -20,7 +20,11 @@ from torchrl_ecpo.functional import (
     centred,
     centred_gaussian_projection,
     check_temperatures,
+    clipped_gain,
+    divergence_penalty,
     effective_sample_size,
+    group_cross_entropy,
+    leave_one_out,
     lift_divergence_estimate,
     lifted_log_weights,
     masked_mean,
@@ -31,6 +35,7 @@ from torchrl_ecpo.functional import (
     self_normalised_weights,
     soft_value,
     soft_value_estimate,
+    squared_residual_projection,
     standardised,
     surrogate_reward,
     surrogate_reward_estimate,
@@ -108,6 +113,24 @@ def _ment(x: Samples, tau, tau_prime, **where) -> Surrogate:
     return ment_surrogate(x.log_prob, x.score, tau=tau, **where)
 
 
+def _squared_residual(x: Samples, tau, tau_prime, **where) -> Surrogate:
+    log_weights = _lift(x, tau, tau_prime)
+    return squared_residual_projection(
+        x.log_prob, x.reference, log_weights, behaviour_log_prob=x.behaviour, **where
+    )
+
+
+def _squared_residual_soft(x: Samples, tau, tau_prime, **where) -> Surrogate:
+    log_weights = _lift(x, tau, tau_prime)
+    return squared_residual_projection(
+        x.log_prob, x.reference, log_weights, normaliser="soft", **where
+    )
+
+
+def _cross_entropy(x: Samples, tau, tau_prime, **where) -> Surrogate:
+    return group_cross_entropy(x.log_prob, _lift(x, tau, tau_prime), **where)
+
+
 def _value(function: Callable[..., Tensor]):
     def call(x: Samples, tau, tau_prime, **where) -> Tensor:
         return function(x.score, x.log_prob, tau=tau, tau_prime=tau_prime, **where)
@@ -120,6 +143,9 @@ SURROGATES = {
     "mean_seeking_controlled": _mean_seeking_controlled,
     "mode_seeking": _mode_seeking,
     "mode_seeking_older_data": _mode_seeking_older_data,
+    "squared_residual": _squared_residual,
+    "squared_residual_soft": _squared_residual_soft,
+    "cross_entropy": _cross_entropy,
     "urex": _urex,
     "ment": _ment,
 }
@@ -135,6 +161,7 @@ ALGEBRA = {
     "weighted_sum": (lambda x, **where: weighted_sum(x, x, **where), 10.0),
     "masked_mean": (masked_mean, 2.0),
     "centred": (centred, (-1.0, 1.0, 0.0)),
+    "leave_one_out": (leave_one_out, (-2.0, 2.0, 0.0)),
     "standardised": (standardised, (-1.0, 1.0, 0.0)),
     "score_function_loss": (lambda x, **where: score_function_loss(x, x, **where), -5.0),
     "lift_divergence_estimate": (
@@ -252,6 +279,36 @@ BY_HAND = {  # a function of log_prob x and of v, which makes vectors; x; weight
         ),
         (-1, -2, -3),
         ((1 / 2, 1 / 4, 1 / 4), -(3 / 4 - 3 / 4 - 9 / 8), (3 / 4, -3 / 8, -3 / 8)),
+    ),
+    # v = 1/2, 1/4, 1/4; log Z = 2.5; log(pi / pi_bar) = -1, 0, 1; residuals 1/2, 3/2, -3/2.
+    "squared_residual": (
+        lambda x, v: squared_residual_projection(
+            x, v(0, -2, -4), v(2, 4, 2), behaviour_log_prob=v(0, -2, -4) - v(2, 1, 1).log()
+        ),
+        (-1, -2, -3),
+        (
+            (1 / 2, 1 / 4, 1 / 4),
+            (0.5 * 0.5**2 + 0.25 * 1.5**2 + 0.25 * 1.5**2) / 2,
+            (-0.5 * 0.5, -0.25 * 1.5, 0.25 * 1.5),
+        ),
+    ),
+    # log Z = log(2 / 2), the residual of the second sample 0 - 1.
+    "squared_residual_soft": (
+        lambda x, v: squared_residual_projection(
+            x, v(-1, -2), v(0.5, 1.5).log(), normaliser="soft"
+        ),
+        (-1 + math.log(0.5), -1 + math.log(1.5)),
+        (
+            (1 / 2, 1 / 2),
+            0.25 * 1,
+            (0, 1 / 2),
+        ),
+    ),
+    # q = 1/8, 2/8, 5/8; p = 1/2, 1/4, 1/4.
+    "cross_entropy": (
+        lambda x, v: group_cross_entropy(x, v(1, 2, 5).log()),
+        (math.log(2), 0, 0),
+        ((1 / 8, 2 / 8, 5 / 8), (1 / 8 + 2 * 7 / 8) * math.log(2), (3 / 8, 0, -3 / 8)),
     ),
     # r / tau - log pi = 1, 1 + log 3, so w = 1/4, 3/4; S = 0 + 1/4, .5 log 1.5 + 3/4.
     # QUARTER is half the distance to the mean, over K.
@@ -777,6 +834,67 @@ def test_scores_are_held_constant_and_the_log_probability_is_not():
     assert not score_function_loss(log_prob, score).requires_grad
     expected = -score.detach() / 4
     assert_close(gradient(lambda x: score_function_loss(x, score), log_prob), expected)
+
+
+# ------------------------------------------------------------------------------ of single steps
+
+
+@DTYPES
+@pytest.mark.parametrize(
+    ("ratio", "advantage", "gain", "slope"),
+    [
+        *[(1.0, 2.0, 2.0, 2.0), (1.0, -2.0, -2.0, -2.0), (1.0, 0.0, 0.0, 0.0)],
+        *[(1.4, 2.0, 2.5, 0.0), (1.4, -2.0, -2.8, -2.8), (1.2, 2.0, 2.4, 2.4)],
+        *[(0.6, 2.0, 1.2, 1.2), (0.6, -2.0, -1.5, 0.0), (0.8, -2.0, -1.6, -1.6)],
+    ],
+)
+def test_clipped_gain_by_hand(dtype, ratio, advantage, gain, slope):
+    """Between 0.75 and 1.25 the ratio counts; outside, only where that is a loss."""
+
+    def call(x):
+        return clipped_gain(x, vector(advantage, dtype=dtype), clip_low=0.25, clip_high=0.25)
+
+    log_ratio = vector(ratio, dtype=dtype).log()
+    found, is_cut = call(log_ratio)
+    assert_close(found.item(), gain, rtol=1e-6, atol=0)
+    assert_close(gradient(lambda x: call(x)[0].sum(), log_ratio).item(), slope, rtol=1e-6, atol=0)
+    assert is_cut.item() is (slope == 0 and advantage != 0)
+
+
+@DTYPES
+def test_divergence_penalty_by_hand(dtype):
+    """Of d = 0, log 2, log 1/2; its slope is 1 - e^d."""
+    log_prob = torch.zeros(3, dtype=dtype)
+    reference = vector(1, 2, 0.5, dtype=dtype).log()
+    expected = vector(0, 1 - math.log(2), -0.5 + math.log(2), dtype=dtype)
+    assert_close(divergence_penalty(log_prob, reference), expected)
+    slope = gradient(lambda x: divergence_penalty(x, reference).sum(), log_prob)
+    assert_close(slope, vector(0, -1, 0.5, dtype=dtype))
+
+
+@DTYPES
+def test_single_steps_of_finite_input_are_never_nan(dtype):
+    largest = torch.finfo(dtype).max
+    values = vector(-1, -1e-3, 0, 1e-3, 1, dtype=dtype) * largest
+    for other in values:
+
+        def gain(x, other=other):
+            return clipped_gain(x, other.expand(5), clip_low=0.2, clip_high=0.3)[0]
+
+        for function in (gain, lambda x, other=other: divergence_penalty(x, other.expand(5))):
+            assert not function(values).isnan().any()
+            assert not gradient(lambda x, f=function: f(x).mean(), values).isnan().any()
+
+
+@pytest.mark.parametrize(("low", "high"), [(1.0, 0.2), (-0.1, 0.2), (0.2, math.inf), (0.2, "1")])
+def test_clips_are_checked(low, high):
+    with pytest.raises(ValueError, match="must be a number >= 0 and < "):
+        clipped_gain(torch.zeros(2), torch.ones(2), clip_low=low, clip_high=high)
+
+
+def test_normaliser_is_checked():
+    with pytest.raises(ValueError, match="normaliser must be 'mean' or 'soft', got 'hard'"):
+        squared_residual_projection(*[torch.zeros(2)] * 3, normaliser="hard")
 
 
 # ------------------------------------------------------------- the lift's divergence, temperatures

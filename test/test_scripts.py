@@ -35,6 +35,9 @@ def run_ecpo(directory, *overrides, afresh=False):
     assert process.returncode == 0, process.stderr
 
 
+LOSSES = sorted(path.stem for path in (ECPO.parent / "config/loss").glob("*.yaml"))
+
+
 @pytest.fixture(scope="module")
 def sweep(tmp_path_factory):
     """Every loss, by one start of the script."""
@@ -42,7 +45,7 @@ def sweep(tmp_path_factory):
     run_ecpo(
         directory,
         "--multirun",
-        "loss=ecpo,pmd,pmd_entropy,urex,ment",
+        "loss=" + ",".join(LOSSES),
         "seed=5",
         "project_steps=3",
         f"hydra.sweep.dir={directory}",
@@ -51,7 +54,7 @@ def sweep(tmp_path_factory):
     return directory
 
 
-@pytest.mark.parametrize("loss", ["ecpo", "pmd", "pmd_entropy", "urex", "ment"])
+@pytest.mark.parametrize("loss", LOSSES)
 def test_every_loss_trains_on_the_bandit(sweep, loss):
     run = sweep / loss
     metrics = read_metrics(run)

@@ -113,6 +113,7 @@ SETTINGS = {
             "loss=ecpo loss.tau=0.25,1.0 seed=3",
             "loss=urex seed=4 env.curriculum=group optim.lr=0.003 optim.amsgrad=false",
             "loss=ment seed=3 project_steps=1 anneal_from=null evaluation_interval=30",
+            "loss=reps seed=4",
         ),
     ),
 }
@@ -143,7 +144,7 @@ def test_methods_and_settings_are_stacked(tmp_path, train, task):
     assert len(list((tmp_path / "stack").glob("run_*"))) == len(RUNS[task])
 
 
-STACK = "stack=['loss=ecpo seed=1','loss=urex seed=2 project_steps=1']"
+STACK = "stack=['loss=ecpo seed=1','loss=reps seed=2 project_steps=1']"
 
 
 @pytest.mark.parametrize("options", [(*BANDIT, "seeds=[1,2]"), (*COPY, STACK)])

@@ -57,7 +57,11 @@ __all__ = [
     "centred",
     "centred_gaussian_projection",
     "check_temperatures",
+    "clipped_gain",
+    "divergence_penalty",
     "effective_sample_size",
+    "group_cross_entropy",
+    "leave_one_out",
     "lift_divergence_estimate",
     "lifted_log_weights",
     "log_mean_exp",
@@ -69,6 +73,7 @@ __all__ = [
     "self_normalised_weights",
     "soft_value",
     "soft_value_estimate",
+    "squared_residual_projection",
     "standardised",
     "surrogate_reward",
     "surrogate_reward_estimate",
@@ -256,7 +261,11 @@ def effective_sample_size(weights: Tensor, *, sample_dim: int = -1) -> Tensor:
 
 
 def lift_divergence_estimate(
-    weights: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None
+    weights: Tensor,
+    *,
+    base_weights: Tensor | None = None,
+    sample_dim: int = -1,
+    mask: Tensor | None = None,
 ) -> Tensor:
     r"""How far the lift goes: KL(target, pi_bar), from samples of the reference.
 
@@ -266,13 +275,22 @@ def lift_divergence_estimate(
     with w the :func:`self_normalised_weights` of M samples that the reference drew. In nats, from 0
     (equal weights) to log M (all weight on one sample), whatever the true divergence is.
 
+    Args:
+        base_weights: ``[E*, K]``, those of the reference itself, where another policy drew the
+            samples; 1/M by default.
+
     Examples:
         >>> lift_divergence_estimate(torch.tensor([[0.5, 0.5], [1.0, 0.0]])) / math.log(2)
         tensor([0., 1.])
     """
-    _check_samples(sample_dim, mask, weights=weights)
+    _check_samples(sample_dim, mask, weights=weights, base_weights=base_weights)
+    log_base = (
+        _log_uniform(weights, sample_dim, mask)
+        if base_weights is None
+        else base_weights.clamp_min(_tiny(base_weights)).log()
+    )
     # 0 log 0 = 0
-    log_ratio = weights.clamp_min(_tiny(weights)).log() - _log_uniform(weights, sample_dim, mask)
+    log_ratio = weights.clamp_min(_tiny(weights)).log() - log_base
     return weighted_sum(weights, log_ratio, sample_dim=sample_dim, mask=mask).clamp_min(0.0)
 
 
@@ -496,6 +514,107 @@ def mode_seeking_projection(
     return Surrogate(-weighted_sum(ratios * advantage, log_prob, **where), ratios)
 
 
+def squared_residual_projection(
+    log_prob: Tensor,
+    reference_log_prob: Tensor,
+    log_weights: Tensor,
+    *,
+    normaliser: str = "mean",
+    behaviour_log_prob: Tensor | None = None,
+    sample_dim: int = -1,
+    mask: Tensor | None = None,
+) -> Surrogate:
+    r"""Project by regression of log pi on the log of the target: Kimi k1.5's loss (2025).
+
+    .. math::
+        L(\theta) = \frac12 \sum_k v_k \left(
+            \omega_k - \log Z - \log\frac{\pi_\theta(\rho_k)}{\bar\pi(\rho_k)} \right)^2, \quad
+        v = \mathrm{softmax}_k \log\frac{\bar\pi}{\beta}
+
+    with v, omega and Z held constant. It is 0 at the target. At pi = pi_bar its gradient is that of
+    :func:`mode_seeking_projection`.
+
+    Args:
+        log_weights: :func:`lifted_log_weights`, of the target relative to the *reference*, whoever
+            drew the samples.
+        normaliser: ``"soft"``, log Z = log sum v exp omega, or ``"mean"``, its lower bound
+            sum v omega, with which the residuals of a policy at the reference have mean 0.
+        behaviour_log_prob: that of the reference by default: v is then 1/K.
+
+    Returns:
+        :class:`Surrogate`: a loss ``[E*]``; its weights are v.
+
+    Examples:
+        At pi = pi_bar: the residuals are 1 - 1/2 and 0 - 1/2.
+
+        >>> log_prob = torch.tensor([-2.0, -1.0], requires_grad=True)
+        >>> reference, log_weights = log_prob.detach(), torch.tensor([1.0, 0.0])
+        >>> loss, v, *_ = squared_residual_projection(log_prob, reference, log_weights)
+        >>> loss.backward(); loss.detach(), log_prob.grad
+        (tensor(0.1250), tensor([-0.2500,  0.2500]))
+    """
+    if normaliser not in ("mean", "soft"):
+        raise ValueError(f"normaliser must be 'mean' or 'soft', got {normaliser!r}.")
+    _check_samples(
+        sample_dim,
+        mask,
+        log_prob=log_prob,
+        reference_log_prob=reference_log_prob,
+        log_weights=log_weights,
+        behaviour_log_prob=behaviour_log_prob,
+    )
+    where: _Where = {"sample_dim": sample_dim, "mask": mask}
+    reference, log_weights = reference_log_prob.detach(), _representable(log_weights.detach())
+    behaviour = reference if behaviour_log_prob is None else behaviour_log_prob.detach()
+    weights = self_normalised_weights(_representable(reference - behaviour), **where)
+    if normaliser == "mean":
+        log_z = weighted_sum(weights, log_weights, **where, keepdim=True)
+    else:
+        log_base = weights.clamp_min(_tiny(weights)).log()
+        log_z = _masked_logsumexp(log_weights + log_base, sample_dim, mask).unsqueeze(sample_dim)
+    residual = log_weights - log_z - _representable(log_prob - reference)
+    if mask is not None:
+        residual = residual.where(mask, 0.0)
+    largest = torch.finfo(residual.dtype).max ** 0.5 / 2  # whose square can be added up
+    return Surrogate(
+        weighted_sum(weights / 2, residual.clamp(-largest, largest).square(), **where), weights
+    )
+
+
+def group_cross_entropy(
+    log_prob: Tensor, log_target: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None
+) -> Surrogate:
+    r"""Cross-entropy between two distributions over the samples of a group: TPO's loss (2026).
+
+    .. math::
+        L(\theta) = -\sum_k q_k \log p_k, \quad
+        q = \mathrm{softmax}_k(\mathrm{log\_target}_k), \quad
+        p = \mathrm{softmax}_k \log \pi_\theta(\rho_k)
+
+    Its gradient in log pi is p - q: that of :func:`mean_seeking_projection` with a control variate
+    whose sampler is uniform.
+
+    Args:
+        log_target: ``[E*, K]``, held constant, up to a constant.
+
+    Returns:
+        :class:`Surrogate`: its weights are q.
+
+    Examples:
+        p = (1/2, 1/2) and q = (3/4, 1/4); the loss is log 2:
+
+        >>> log_prob = torch.tensor([-1.0, -1.0], requires_grad=True)
+        >>> loss, q, *_ = group_cross_entropy(log_prob, torch.tensor([3.0, 1.0]).log())
+        >>> loss.backward(); loss.detach(), log_prob.grad
+        (tensor(0.6931), tensor([-0.2500,  0.2500]))
+    """
+    _check_samples(sample_dim, mask, log_prob=log_prob, log_target=log_target)
+    where: _Where = {"sample_dim": sample_dim, "mask": mask}
+    weights = self_normalised_weights(log_target.detach(), **where)
+    normaliser = _masked_logsumexp(log_prob, sample_dim, mask).unsqueeze(sample_dim)
+    return Surrogate(weighted_sum(weights, _representable(normaliser - log_prob), **where), weights)
+
+
 def urex_surrogate(
     log_prob: Tensor,
     score: Tensor,
@@ -566,6 +685,71 @@ def ment_surrogate(
     signal = score - tau * log_prob.detach()
     loss = score_function_loss(log_prob, centred(signal, **where), **where)
     return Surrogate(loss, uniform_weights(log_prob, **where))
+
+
+def clipped_gain(
+    log_ratio: Tensor, advantage: Tensor, *, clip_low: float, clip_high: float
+) -> tuple[Tensor, Tensor]:
+    r"""The clipped gain of each sample, or step (Schulman et al. 2017), which GRPO ascends.
+
+    .. math::
+        \min\left(\rho A, \; \mathrm{clip}(\rho, 1 - \epsilon_{low}, 1 + \epsilon_{high}) A\right),
+        \qquad \rho = \frac{\pi_\theta}{\beta}
+
+    Args:
+        log_ratio: ``[E*, K]``, log rho; carries the gradient.
+        advantage: ``[E*, K]``, held constant: :func:`centred` or :func:`standardised` scores.
+        clip_low: how far below 1 the ratio of what was worse counts; below 1.
+        clip_high: how far above 1 the ratio of what was better counts.
+
+    Returns:
+        The gain ``[E*, K]``, and True where it is cut off, so that it has no gradient.
+
+    Examples:
+        Ratios 2, 2, 1/2, 1/2 with advantages 1, -1, 1, -1: the first and the last are cut off.
+
+        >>> log_ratio = torch.tensor([2.0, 2.0, 0.5, 0.5]).log()
+        >>> advantage = torch.tensor([1.0, -1.0, 1.0, -1.0])
+        >>> clipped_gain(log_ratio, advantage, clip_low=0.25, clip_high=0.5)
+        (tensor([ 1.5000, -2.0000,  0.5000, -0.7500]), tensor([ True, False, False,  True]))
+    """
+    for name, value, bound in (("clip_low", clip_low, 1.0), ("clip_high", clip_high, math.inf)):
+        if not (_is_number(value) and 0 <= value < bound):
+            raise ValueError(f"{name} must be a number >= 0 and < {bound:g}, got {value!r}.")
+    _check_samples(log_ratio=log_ratio, advantage=advantage)
+    advantage, log_ratio = advantage.detach(), _representable(log_ratio)
+    too_low, too_high = math.log1p(-clip_low), math.log1p(clip_high)
+    # The less of the two gains: the ratio is bounded from above, or from below if A is negative.
+    limited = torch.where(
+        advantage > 0,
+        log_ratio.clamp(max=too_high),
+        log_ratio.clamp(min=too_low, max=_largest_exponent(log_ratio)),
+    )
+    return _representable(limited.exp() * advantage), limited != log_ratio
+
+
+def divergence_penalty(log_prob: Tensor, reference_log_prob: Tensor) -> Tensor:
+    r"""Estimate of KL(pi, pi_bar) by each sample, or step, of pi: GRPO's penalty.
+
+    .. math:: e^d - d - 1, \qquad d = \log\frac{\bar\pi}{\pi_\theta}
+
+    Never below 0, and with the right expectation, which -d alone has too (Schulman, *Approximating
+    KL divergence*, 2020).
+
+    Returns:
+        ``[E*, K]``.
+
+    Examples:
+        d = log 2 and 0:
+
+        >>> penalty = divergence_penalty(torch.tensor([0.25, 0.5]).log(), torch.tensor(0.5).log())
+        >>> penalty + torch.tensor([2.0, 1.0]).log()
+        tensor([1., 0.])
+    """
+    _check_samples(log_prob=log_prob, reference_log_prob=reference_log_prob)
+    distance = _representable(reference_log_prob.detach() - log_prob)
+    distance = distance.clamp(max=_largest_exponent(distance))
+    return distance.expm1() - distance
 
 
 # -------------------------------------------------------------------------------- soft values
@@ -819,6 +1003,24 @@ def standardised(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = N
     return (unit / variance.sqrt()).where(is_spread, 0.0)
 
 
+def leave_one_out(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None) -> Tensor:
+    r"""Scores less the mean of the *others* of their group: RLOO's advantage.
+
+    .. math:: A_k = r_k - \frac1{K-1} \sum_{j \ne k} r_j = \frac{K}{K-1} (r_k - \bar r)
+
+    Returns:
+        ``[E*, K]``, detached; 0 where masked, and for a sample without others.
+
+    Examples:
+        >>> leave_one_out(torch.tensor([1.0, 2.0, 9.0]), mask=torch.tensor([True, True, False]))
+        tensor([-1.,  1.,  0.])
+    """
+    distance = centred(score, sample_dim=sample_dim, mask=mask)
+    real = torch.ones_like(distance) if mask is None else mask.expand_as(distance)
+    size = real.sum(sample_dim, keepdim=True, dtype=distance.dtype)
+    return distance * size / (size - 1).clamp_min(1)
+
+
 def score_function_loss(
     log_prob: Tensor, advantage: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None
 ) -> Tensor:
@@ -827,7 +1029,8 @@ def score_function_loss(
     .. math:: L(\theta) = -\frac1K \sum_k A_k \log \pi_\theta(\rho_k)
 
     Args:
-        advantage: ``[E*, K]``, held constant: :func:`centred` or :func:`standardised` scores.
+        advantage: ``[E*, K]``, held constant: scores that are :func:`centred`,
+            :func:`leave_one_out` or :func:`standardised`.
 
     Examples:
         >>> log_prob = torch.tensor([-1.0, -2.0], requires_grad=True)
@@ -874,6 +1077,10 @@ def _representable(values: Tensor) -> Tensor:
     values = values if values.is_floating_point() else values.to(torch.get_default_dtype())
     largest = torch.finfo(values.dtype).max / 4
     return values.clamp(-largest, largest)
+
+
+def _largest_exponent(like: Tensor) -> float:
+    return math.log(torch.finfo(like.dtype).max) - 1
 
 
 def _lowest(like: Tensor) -> float:

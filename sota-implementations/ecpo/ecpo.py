@@ -1,4 +1,4 @@
-"""Train ECPO, PMD, UREX or MENT on groups of trajectories: Algorithm 1 and its baselines.
+"""Train ECPO or a rival of it on groups of trajectories: Algorithm 1 and its baselines.
 
 ``python ecpo.py env=bandit loss=ecpo seed=1``; every option is in ``config/``. ``seeds=[0,1,2]``
 and ``stack=[...]`` train several independent runs in one process (``stacked/``).
@@ -21,6 +21,7 @@ from utils import (
     make_run,
     make_temperatures,
     reached,
+    total_loss,
 )
 
 from torchrl_ecpo.collectors import shut_down
@@ -70,7 +71,7 @@ def main(config: DictConfig) -> None:
                 groups = next(groups_of_trajectories)
                 losses = loss_module(groups)
                 optimizer.zero_grad()
-                losses["loss_actor"].backward()
+                total_loss(losses, loss_module).backward()
                 grad_norm = clip_grad_norm_(loss_module.parameters(), max_grad_norm)
                 metrics = {**losses.detach(), "grad_norm": grad_norm}
                 run.check(metrics, progress.trajectories)

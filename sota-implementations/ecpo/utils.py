@@ -10,26 +10,29 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tasks import Metrics, Task
+from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 
+import torchrl_ecpo
 from torchrl_ecpo import ECPOLoss, MENTLoss, PMDLoss, TrajectoryGroupLoss, UREXLoss
 from torchrl_ecpo.collectors import TrajectoryGroupCollector
 from torchrl_ecpo.experiment import Run
 from torchrl_ecpo.schedules import TemperatureScheduler, make_schedule
 
-LOSSES = {
+LOSSES = {  # whose files in config/loss/ are older than the entry class
     "ecpo": ECPOLoss,
     "pmd": PMDLoss,
     "pmd_entropy": PMDLoss,
     "urex": UREXLoss,
     "ment": MENTLoss,
 }
-TEMPERATURES = ("tau", "tau_prime")
+TEMPERATURES = ("tau", "tau_prime", "kl_to_ref_coeff")
 COMPILABLE = ("bandit", "gym")
 
 
 def check_config(config: DictConfig) -> None:
     """Refuse options that do not go together."""
+    loss_class(config.loss)
     if config.compile and not (config.seeds is None and config.stack is None):
         raise ValueError(
             "compile=true is for single runs. Leave out compile, or seeds and stack: --multirun "
@@ -83,8 +86,20 @@ def is_single(config: DictConfig) -> bool:
 
 def make_loss(config: DictConfig, actor: ProbabilisticTensorDictSequential) -> TrajectoryGroupLoss:
     """The loss that ``loss=`` names; ``make_temperatures`` sets its temperatures."""
-    options = {str(k): v for k, v in config.items() if k not in ("name", *TEMPERATURES)}
-    return LOSSES[config.name](actor, **options)
+    apart = ("name", "class", *TEMPERATURES)
+    options = {str(k): v for k, v in config.items() if k not in apart}
+    return loss_class(config)(actor, **options)
+
+
+def loss_class(config: DictConfig) -> type[TrajectoryGroupLoss]:
+    """The one that ``loss.class`` names; of the oldest, ``loss.name``."""
+    found = LOSSES.get(config.name) or getattr(torchrl_ecpo, str(config.get("class")), None)
+    if not (isinstance(found, type) and issubclass(found, TrajectoryGroupLoss)):
+        raise ValueError(
+            "loss.class must be a loss over groups of torchrl_ecpo, such as GRPOLoss, got "
+            f"{config.get('class')!r}."
+        )
+    return found
 
 
 def make_optimizer(
@@ -92,6 +107,11 @@ def make_optimizer(
 ) -> torch.optim.Optimizer:
     """Adam."""
     return torch.optim.Adam(parameters, lr=config.lr, eps=config.eps, amsgrad=config.amsgrad)
+
+
+def total_loss(losses: TensorDictBase, loss_module: TrajectoryGroupLoss) -> torch.Tensor:
+    """The policy's and, where a temperature is learned, that of it."""
+    return torch.stack([losses[name] for name in ("loss_actor", *loss_module.losses)]).sum()
 
 
 def make_temperatures(config: DictConfig, loss_module: TrajectoryGroupLoss) -> TemperatureScheduler:

@@ -19,16 +19,21 @@ def numbers(*shape):
 
 GOOD = {
     **{name: numbers(3, 4) for name in ("score", "log_weights", "values", "advantage", "like")},
+    **{name: numbers(3, 4) for name in ("log_ratio", "log_target")},
     **{
         name: numbers(3, 4).log_softmax(-1)
         for name in ("log_prob", "reference_log_prob", "control_log_prob", "behaviour_log_prob")
     },
     "weights": numbers(3, 4).softmax(-1),
+    "base_weights": numbers(3, 4).softmax(-1),
     "mask": torch.tensor([True, True, False, True]).repeat(3, 1),
     "sample_dim": -1,
     "keepdim": True,
     "tau": 0.5,
     "tau_prime": 0.25,
+    "clip_low": 0.2,
+    "clip_high": 0.3,
+    "normaliser": "mean",
     "log_temperature": torch.tensor(0.5),
     "excess": numbers(3),
     "loc": numbers(3, 2),
@@ -38,7 +43,10 @@ GOOD = {
     "num_trajectories": 7,
     "allow_zero": False,
 }
-OPTIONAL = ("mask", "sample_dim", "keepdim", "control_log_prob", "behaviour_log_prob", "allow_zero")
+OPTIONAL = (
+    *("mask", "sample_dim", "keepdim", "control_log_prob", "behaviour_log_prob", "allow_zero"),
+    *("base_weights", "normaliser"),
+)
 NAMES = [name for name in functional.__all__ if name not in ("Surrogate", "check_temperatures")]
 
 

@@ -5,9 +5,15 @@ from __future__ import annotations
 import pytest
 import torch
 from faults import NO_NETWORKS, Subject, check, tensordict_of
-from trajectory_problems import CASES, LIFTING, MASK, make_actor, sample
+from trajectory_problems import CASES, DELAYED, MASK, Case, ecpo, make_actor, sample
 
-OPTIONS = ("tau", "tau_prime", "delay_actor", "reduction", "control_variate")
+from torchrl_ecpo import REPSLoss
+
+LOSSES = {**CASES, "reps": Case(REPSLoss, {"tau": 0.7, "tau_prime": 0.3}, ecpo, {"epsilon": 0.4})}
+OPTIONS = (
+    *("tau", "tau_prime", "delay_actor", "reduction", "control_variate", "epsilon", "normaliser"),
+    *("clip_epsilon", "score", "aggregation", "ratio", "kl_to_ref_coeff", "length_norm"),
+)
 SHAPE = (2, 3, 4)
 NAMES = "names of groups, which agree within each"
 FINE = {("group", fault): NAMES for fault in ("text", "complex", "halves", "flags")}
@@ -30,7 +36,7 @@ def call(case, kind):
         loss_module = case.loss(**networks, **options)
         batch = {key: x for key, x in entries.items() if key not in (*OPTIONS, "actor_network")}
         losses = loss_module(tensordict_of(batch, SHAPE))
-        losses["loss_actor"].sum().backward()
+        sum(losses[name].sum() for name in ("loss_actor", *loss_module.losses)).backward()
         gradients = [parameter.grad for parameter in loss_module.parameters()]
         return {name: value.detach() for name, value in losses.items()}, gradients
 
@@ -38,11 +44,11 @@ def call(case, kind):
 
 
 def subject(name, kind):
-    case = CASES[name]
-    options = {**case.temperatures, "reduction": "none"}
-    if name in LIFTING:
+    case = LOSSES[name]
+    options = {**case.temperatures, **case.options, "reduction": "none"}
+    if name in (*DELAYED, "reps"):
         options["delay_actor"] = False
-    if name == "ecpo":
+    if name in ("ecpo", "reps"):
         options["control_variate"] = False
     entries = good(kind) | options | {"actor_network": lambda: make_actor(kind)}
     return Subject(
@@ -55,6 +61,6 @@ def subject(name, kind):
 
 
 @pytest.mark.parametrize("kind", ["categorical", "normal"])
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", LOSSES)
 def test_trajectory_losses(name, kind):
-    check(f"`{CASES[name].loss.__name__}`, {kind} policy", subject(name, kind))
+    check(f"`{LOSSES[name].loss.__name__}`, {kind} policy", subject(name, kind))

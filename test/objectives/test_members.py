@@ -1,12 +1,17 @@
-"""What is particular to each member: ECPO, PMD, UREX, MENT."""
+"""What is particular to each member over trajectories, and where two of them are one."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 from torch.testing import assert_close
+from torchrl.objectives import HardUpdate
 from trajectory_problems import (
     CASES,
+    expected_losses,
     gradients,
     make_actor,
     move,
@@ -16,22 +21,39 @@ from trajectory_problems import (
     problem,
     reinforce,
     sample,
+    scores,
     split,
 )
 
-from torchrl_ecpo.objectives import ECPOLoss, MENTLoss, PMDLoss, UREXLoss
+from torchrl_ecpo.functional import mean_seeking_projection, soft_value_estimate
+from torchrl_ecpo.objectives import (
+    ECPOLoss,
+    GRPOLoss,
+    MENTLoss,
+    PMDLoss,
+    REPSLoss,
+    RLOOLoss,
+    SquaredPMDLoss,
+    TPOLoss,
+    UREXLoss,
+)
 
 CASE = CASES["ecpo"]
+DrGRPOLoss = partial(GRPOLoss, score="return", aggregation="prompt_sum")
 
 
 @pytest.mark.parametrize(
     ("loss_class", "tau", "tau_prime"),
-    [(ECPOLoss, 0.5, 0.01), (PMDLoss, 0.5, 0.0), (UREXLoss, 0.1, None), (MENTLoss, 0.01, None)],
+    [
+        *[(ECPOLoss, 0.5, 0.01), (PMDLoss, 0.5, 0.0), (SquaredPMDLoss, 0.5, 0.0)],
+        *[(UREXLoss, 0.1, None), (MENTLoss, 0.01, None), (RLOOLoss, 0.0, None)],
+        *[(TPOLoss, 1.0, None), (REPSLoss, 1.0, 0.0)],
+    ],
 )
 def test_defaults(loss_class, tau, tau_prime):
     """As documented; the paper's PMD has no entropy term."""
     loss = loss_class(make_actor())
-    assert_close(loss.tau, torch.tensor(tau))
+    assert_close(loss.temperature("tau"), torch.tensor(tau))
     if tau_prime is not None:
         assert_close(loss.tau_prime, torch.tensor(tau_prime))
     assert (loss.delay_actor, loss.reduction) == (False, "mean")
@@ -92,17 +114,26 @@ def test_control_variate(delayed):
 
 
 @pytest.mark.parametrize(
-    ("loss_class", "tau"), [(PMDLoss, 0.1), (PMDLoss, 1.0), (PMDLoss, 10.0), (MENTLoss, 0.0)]
+    "loss_class",
+    [
+        *[partial(PMDLoss, tau=tau) for tau in (0.1, 1.0, 10.0)],
+        *[partial(SquaredPMDLoss, tau=tau) for tau in (0.1, 1.0, 10.0)],
+        partial(MENTLoss, tau=0.0),
+        DrGRPOLoss,
+        partial(DrGRPOLoss, ratio="trajectory"),
+    ],
+    ids=str,
 )
-def test_reinforce_at_the_reference(loss_class, tau):
-    """PMD at theta = reference, tau' = 0, for any tau; MENT without an entropy term.
+def test_reinforce_at_the_reference(loss_class):
+    """PMD and its regression at theta = reference, tau' = 0, for any tau; MENT without an entropy
+    term; the first step of Dr.GRPO.
 
     The group's mean is the baseline, which a constant added to all returns does not change.
     """
     actor = make_actor()
     batch = pad(sample(actor, 2, 3, 4))
     expected = torch.stack([reinforce(numbers(actor, group)) for group in split(batch)]).mean()
-    loss = loss_class(actor, tau=tau).double()
+    loss = loss_class(actor).double()
     got = gradients(loss(batch)["loss_actor"], actor)
     assert_close(got, gradients(expected, actor))
     batch["next", "reward"][..., 0, 0] += 5.0
@@ -174,3 +205,151 @@ def test_entropy_alone():
     before["loss_actor"].backward()
     torch.optim.SGD(loss.parameters(), lr=1e-2).step()
     assert loss(batch)["entropy"] > before["entropy"]
+
+
+# ------------------------------------------------------------------------- RLOO, GRPO, TPO, Kimi
+
+
+@pytest.mark.parametrize("tau", [0.0, 0.3])
+@pytest.mark.parametrize("masked", [(), (1,)])
+def test_rloo_is_ment_times_k_over_k_minus_1(tau, masked):
+    """K is the number of trajectories that are there."""
+    actor = make_actor()
+    batch = pad(sample(actor, 2, 4, 4), masked=masked)
+    rloo, ment = (
+        loss(actor, tau=tau, reduction="none").double()(batch)["loss_actor"]
+        for loss in (RLOOLoss, MENTLoss)
+    )
+    assert_close(rloo, ment * torch.tensor([3 / 2 if masked else 4 / 3, 4 / 3]).double())
+
+
+OPTIONS = [
+    ("grpo", {"score": "return"}),
+    ("grpo", {"aggregation": "prompt_sum", "score": "return"}),
+    ("grpo", {"aggregation": "token_mean", "clip_epsilon": (0.05, 0.3)}),
+    ("grpo", {"ratio": "trajectory", "clip_epsilon": (0.02, 0.03)}),
+    ("grpo", {"ratio": "trajectory", "aggregation": "token_mean"}),
+    ("tpo", {"score": "return"}),
+    ("tpo", {"length_norm": True}),
+    ("squared_pmd", {"normaliser": "soft"}),
+]
+
+
+@pytest.mark.parametrize(("name", "options"), OPTIONS, ids=str)
+@pytest.mark.parametrize("delayed", [False, True], ids=["recorded", "delayed"])
+def test_options_are_their_formula(name, options, delayed):
+    """Value and gradient of each option that has not been a default so far."""
+    case = replace(CASES[name], options=CASES[name].options | options)
+    loss, actor, batch = problem(case, lag=0.1 * delayed, delay_actor=delayed)
+    reference = [make_actor()] if delayed else []
+    for each in reference:
+        move(each, 0.1)
+    expected = expected_losses(case, actor, batch, *reference).mean()
+    out = loss(batch)
+    assert_close(out["loss_actor"], expected)
+    assert_close(gradients(out["loss_actor"], actor), gradients(expected, actor))
+    if name == "grpo":
+        assert 0 < out["clip_fraction"] < 1
+
+
+@pytest.mark.parametrize("score", ["group", "return"])
+def test_tpo_has_ecpos_weights_with_the_entropy_term_of_the_other_sign(score):
+    """tau' / (tau + tau') = -1; and its sampler is taken for uniform in the control variate."""
+    case = replace(CASES["tpo"], options={"score": score, "length_norm": False})
+    loss, actor, batch = problem(case)
+    [eta] = case.temperatures.values()
+    tau, tau_prime = 2 * eta, -eta
+    parts, sizes = [], []
+    for n in (numbers(actor, group) for group in split(batch)):
+        log_weights = (scores(n, score) - tau_prime * n.reference) / (tau + tau_prime)
+        uniform = torch.zeros_like(n.reference)
+        ecpo = mean_seeking_projection(n.log_prob, log_weights, control_log_prob=uniform)
+        parts.append(ecpo.loss)
+        sizes.append(1 / ecpo.weights.square().sum())
+    out = loss(batch)
+    assert_close(out["ESS"], torch.stack(sizes).mean())
+    got = gradients(out["loss_actor"], actor)
+    assert_close(got, gradients(torch.stack(parts).mean(), actor))
+
+
+@pytest.mark.parametrize("normaliser", ["mean", "soft"])
+def test_squared_pmd_is_zero_at_its_target_with_the_soft_normaliser(normaliser):
+    """With the mean return it is 0 only where the lift is small."""
+    actor = make_actor()
+    batch = sample(actor, 4, 1)
+    batch["observation"].zero_()
+    batch["action"] = torch.arange(4).unsqueeze(-1)
+    batch["action_log_prob"].fill_(0.25).log_()
+    loss = SquaredPMDLoss(actor, tau=1.0, normaliser=normaliser).double()
+    weights = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
+    batch["next", "reward"] = weights.log().view(4, 1, 1)
+    actor.module[0].module[0].bias.data.copy_(weights.log())  # type: ignore
+    assert (loss(batch)["loss_actor"].item() < 1e-20) is (normaliser == "soft")
+
+
+@pytest.mark.parametrize(
+    ("clip_epsilon", "message"),
+    [(-0.1, "got -0.1"), ((0.2, -0.1), "got .0.2"), (1.0, "got 1.0"), ((1.0, 0.2), "< 1 downw")],
+)
+def test_clip_epsilon_is_checked(clip_epsilon, message):
+    with pytest.raises(ValueError, match=f"clip_epsilon must be >= 0.*{message}"):
+        GRPOLoss(make_actor(), clip_epsilon=clip_epsilon)
+
+
+# -------------------------------------------------------------------------------------------- REPS
+
+
+@pytest.mark.parametrize(("epsilon", "tau_prime"), [(0.05, 0.0), (0.3, 0.2), (0.6, 0.0)])
+@pytest.mark.parametrize("padded", [False, True], ids=["whole", "padded"])
+def test_reps_finds_the_temperature_of_its_bound(epsilon, tau_prime, padded):
+    """The gradient is that of the dual; where it is 0, the lift's mean length is epsilon nats."""
+    actor = make_actor()
+    batch = sample(actor, 5, 6, 4)
+    batch = pad(batch) if padded else batch
+    groups = [numbers(actor, group) for group in split(batch)]
+    loss = REPSLoss(actor, epsilon=epsilon, tau_prime=tau_prime).double()
+    loss.tau_prime = tau_prime
+    for step in range(60):
+        out = loss(batch)
+        (slope,) = torch.autograd.grad(out["loss_tau"], loss.log_tau)
+        assert_close(slope, epsilon - out["kl_target_reference"])
+        if not step:
+            tau = torch.tensor(1.0).double().requires_grad_()
+            values = [
+                soft_value_estimate(n.returns, n.reference, tau=tau, tau_prime=tau_prime)
+                for n in groups
+            ]
+            dual = tau * epsilon + torch.stack(values).mean()
+            assert_close(slope, *torch.autograd.grad(dual, tau))
+        loss.log_tau.data -= slope / (2 * epsilon)
+    assert_close(out["kl_target_reference"].item(), epsilon, atol=1e-6, rtol=0)
+    assert_close(out["tau"], loss.temperature("tau"))
+    ecpo = ECPOLoss(actor).double()
+    ecpo.tau, ecpo.tau_prime = out["tau"], tau_prime
+    names = ("loss_actor", "ESS", "max_weight")
+    assert_close(out.select(*names), ecpo(batch).select(*names))
+
+
+def test_reps_measures_from_the_reference():
+    """Also where another policy drew the trajectories."""
+    actor, reference = make_actor(), make_actor()
+    batch = sample(actor, 2, 6, 4)
+    move(actor, 0.3)
+    move(reference, 0.3)
+    loss = REPSLoss(actor, delay_actor=True).double()
+    HardUpdate(loss, value_network_update_interval=1)
+    expected = []
+    for n in (numbers(actor, group, reference) for group in split(batch)):
+        base = normalise((n.reference - n.behaviour).exp())
+        weights = normalise(base * n.returns.exp())
+        expected.append((weights * (weights / base).log()).sum())
+    assert_close(loss(batch)["kl_target_reference"], torch.stack(expected).mean())
+
+
+def test_what_reps_refuses():
+    for epsilon in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match=f"epsilon must be above 0, in nats, got {epsilon}"):
+            REPSLoss(make_actor(), epsilon=epsilon)
+    loss = REPSLoss(make_actor())
+    with pytest.raises(AttributeError, match="tau is learned"):
+        loss.tau = 0.5

@@ -1,4 +1,4 @@
-"""The members that the tutorial writes: their length, and their numbers."""
+"""The members that the tutorial writes: their length, and their numbers; and what members add."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from torchrl.objectives import HardUpdate
 from trajectory_problems import MASK, gradients, make_actor, move, pad, sample, split
 
 from torchrl_ecpo import ECACLoss, PolyakAverage, TemperatureScheduler, TrajectoryGroupLoss
+from torchrl_ecpo import REPSLoss as PublicREPSLoss
 from torchrl_ecpo.functional import Surrogate
 from torchrl_ecpo.schedules import linear
 
@@ -180,8 +181,12 @@ OUT_KEYS = {
         *("loss_actor", "loss_dual", "ESS", "max_weight", "eta", "kl_target_reference"),
         *OF_GROUPS,
     ],
+    PublicREPSLoss: [
+        *("loss_actor", "loss_tau", "ESS", "max_weight", "tau", "kl_target_reference"),
+        *OF_GROUPS,
+    ],
 }
-members = pytest.mark.parametrize("loss_class", OUT_KEYS, ids=lambda c: c.__name__)
+members = pytest.mark.parametrize("loss_class", OUT_KEYS, ids=str)
 
 
 @members

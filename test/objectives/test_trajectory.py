@@ -21,7 +21,7 @@ from trajectory_problems import (
     ACTOR_KEYS,
     ACTORS,
     CASES,
-    LIFTING,
+    DELAYED,
     MASK,
     Numbers,
     expected_losses,
@@ -41,7 +41,7 @@ from torchrl_ecpo.updaters import PeriodicCopy, PolyakAverage
 SHAPES = [(3, 4), (2, 3, 4), (2, 2, 3, 4)]
 ECPO = CASES["ecpo"]  # of which is asked what stands once in the base class
 losses = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-lifting = pytest.mark.parametrize("case", [CASES[n] for n in LIFTING], ids=LIFTING)
+delayable = pytest.mark.parametrize("case", [CASES[n] for n in DELAYED], ids=DELAYED)
 actors = pytest.mark.parametrize("kind", ACTORS)
 padding = pytest.mark.parametrize("padded", [False, True], ids=["whole", "padded"])
 
@@ -111,7 +111,8 @@ def test_float32(case):
 def test_half_precision(case, autocast):
     """What an actor gives in half precision is added up, and reckoned with, in single precision."""
     actor = make_actor(dtype=torch.float32 if autocast else torch.bfloat16)
-    batch = sample(actor, 1, 8, 300)
+    batch = torch.cat([sample(actor, 1, 8, 30)] * 10, -1)
+    batch["next", "done"][..., :-1, :] = False
     batch["next", "reward"] = torch.zeros(1, 8, 300, 1)
     batch["next", "reward"][0, :, -1, 0] = returns = 10 + 0.01 * torch.arange(8)
     batch["action_log_prob"] = batch["action_log_prob"].bfloat16()
@@ -214,7 +215,7 @@ def test_padded_junk_is_no_bad_input():
 # --------------------------------------------------------------------------------------- reference
 
 
-@lifting
+@delayable
 @actors
 @padding
 def test_delayed_reference_and_older_data(case, kind, padded):
@@ -225,7 +226,7 @@ def test_delayed_reference_and_older_data(case, kind, padded):
     assert_same(loss, actor, batch, expected_losses(case, actor, batch, reference))
 
 
-@lifting
+@delayable
 def test_delayed_reference_without_recorded_log_prob(case):
     """Nothing recorded: the data is taken to be the reference's, that is, the target's."""
     loss, actor, batch = problem(case, padded=False, delay_actor=True)
@@ -305,13 +306,12 @@ TRAJECTORIES = torch.cartesian_prod(*[torch.arange(2)] * 3)
 RETURNS = torch.tensor([0.3, -1.0, 0.0, 2.0, 1.1, 0.4, -0.2, 0.9], dtype=torch.float64)
 
 
-def _log_prob(actor) -> Tensor:
-    """[8], of every trajectory there is."""
-    table = next(actor.parameters()).log_softmax(-1)
-    return table[torch.arange(3), TRAJECTORIES].sum(-1)
+def _steps(actor) -> Tensor:
+    """[8, 3], log-probability of each step of every trajectory there is."""
+    return next(actor.parameters()).log_softmax(-1)[torch.arange(3), TRAJECTORIES]
 
 
-def _enumeration(which: Tensor, log_prob: Tensor) -> TensorDict:
+def _enumeration(which: Tensor, steps: Tensor) -> TensorDict:
     """The trajectories numbered ``which``, with the log-probability under their sampler."""
     shape = (len(which), 3)
     reward = torch.zeros(*shape, 1, dtype=torch.float64)
@@ -320,18 +320,27 @@ def _enumeration(which: Tensor, log_prob: Tensor) -> TensorDict:
         {
             "time": torch.arange(3).expand(shape),
             "action": TRAJECTORIES[which],
-            "action_log_prob": (log_prob[which] / 3).unsqueeze(-1).expand(shape),
+            "action_log_prob": steps[which].detach(),
             "next": {"reward": reward},
         },
         batch_size=shape,
     )
 
 
-def _objective(name: str, log_prob: Tensor, reference: Tensor, tau: float, tau_prime: float = 0.0):
-    """What the paper minimises, exactly, over all trajectories."""
-    prob = log_prob.exp()
-    if name == "ment":
-        return -(prob * (RETURNS - tau * log_prob)).sum()
+def _objective(
+    name: str, log_prob: Tensor, reference: Tensor, tau: float = 0.0, tau_prime: float = 0.0, **_
+):
+    """What is minimised, exactly, over all trajectories; of GRPO at the reference."""
+    prob, old = log_prob.exp(), reference.exp()
+    if name in ("ment", "rloo"):
+        size = 1 if name == "ment" else 32 / 31
+        return -(prob * (RETURNS - tau * log_prob)).sum() * size
+    deviation = (old * (RETURNS - (old * RETURNS).sum()) ** 2).sum().sqrt()
+    if name == "grpo":
+        return -(prob * RETURNS).sum() / deviation / 3  # the mean over three steps
+    if name == "tpo":  # the old policy counts twice
+        target = (2 * reference + RETURNS / deviation / tau).softmax(0)
+        return -(target * log_prob).sum() + (old * prob).sum().log()
     if name == "urex":
         target = (RETURNS / tau).softmax(0)
         return -(prob * RETURNS).sum() - tau * (target * log_prob).sum()
@@ -346,26 +355,27 @@ def _objective(name: str, log_prob: Tensor, reference: Tensor, tau: float, tau_p
 def test_exact_sample_gives_the_exact_gradient(name):
     """K = 32 samples in the exact proportions of the policy: the gradient of the objective."""
     case, actor = CASES[name], _tabular_actor()
-    log_prob = _log_prob(actor)
+    steps = _steps(actor)
+    log_prob = steps.sum(-1)
     counts = (32 * log_prob.detach().exp()).round().long()
     assert counts.sum() == 32
     which = torch.arange(8).repeat_interleave(counts)
-    got = gradients(case.build(actor)(_enumeration(which, log_prob.detach()))["loss_actor"], actor)
+    got = gradients(case.build(actor)(_enumeration(which, steps))["loss_actor"], actor)
     objective = _objective(name, log_prob, log_prob.detach(), **case.temperatures)
     assert_close(got, gradients(objective, actor))
 
 
-@pytest.mark.parametrize("name", LIFTING)
+@pytest.mark.parametrize("name", ["ecpo", "pmd"])
 def test_all_trajectories_of_a_uniform_sampler_give_the_exact_gradient(name):
     """K = all trajectories, drawn uniformly; policy, reference and sampler are all different."""
     case, actor = CASES[name], _tabular_actor()
     loss = case.build(actor, delay_actor=True)
     HardUpdate(loss, value_network_update_interval=1)
-    reference = _log_prob(actor).detach()
+    reference = _steps(actor).sum(-1).detach()
     move(actor, 0.5)
-    uniform = torch.full_like(reference, 1 / 8).log()
+    uniform = torch.full((8, 3), 0.5).double().log()
     out = loss(_enumeration(torch.arange(8), uniform))
-    log_prob = _log_prob(actor)
+    log_prob = _steps(actor).sum(-1)
     objective = _objective(name, log_prob, reference, **case.temperatures)
     assert_close(gradients(out["loss_actor"], actor), gradients(objective, actor))
     divergence = (reference.exp() * (reference - log_prob)).sum()
@@ -406,16 +416,17 @@ def test_diagnostics(case, masked):
     with torch.no_grad():
         for group in split(batch):
             n = numbers(actor, group)
-            weights = case.formula(n, **case.temperatures)[1]
+            weights = case.formula(n, **case.temperatures, **case.options)[1]
             expected.append(TensorDict(_expected_diagnostics(n, weights)))
     expected = torch.stack(expected)
-    assert_close(out.exclude("loss_actor"), expected)
+    own = ("loss_actor", "clip_fraction")
+    assert_close(out.exclude(*own), expected)
     assert expected["equal_return_groups"].tolist() == [0.0, 0.0, 1.0]
     assert (out["ESS"] >= 1).all()
     assert (out["ESS"] <= 3).all()
     for reduction in ("mean", "sum"):
-        means = case.build(actor, reduction=reduction)(batch).exclude("loss_actor")
-        assert_close(means, expected.mean(0))
+        means = case.build(actor, reduction=reduction)(batch)
+        assert_close(means.exclude(*own), expected.mean(0))
 
 
 @losses
@@ -769,15 +780,16 @@ def test_bad_temperature_written_or_loaded(name, temperature, value):
 def test_temperatures_of_zero(case):
     """All 0 are refused by the constructor and by the schedule's last step; one of two may be 0.
 
-    tau' = 0 is the paper's ablation, tau = 0 UREX's weights, and MENT's tau = 0 REINFORCE.
+    tau' = 0 is the paper's ablation, tau = 0 UREX's weights, and MENT's tau = 0 REINFORCE; GRPO's
+    coefficient of the penalty is none.
     """
     loss, _, batch = problem(case)
     *others, last = case.temperatures
     for other in others:
         setattr(loss, other, 0.0)
         assert loss(batch)["loss_actor"].isfinite()
-    if case is CASES["ment"]:
-        loss.tau = 0
+    if case in (CASES["ment"], CASES["rloo"], CASES["grpo"]):
+        setattr(loss, last, 0)
         assert loss(batch)["loss_actor"].isfinite()
         return
     message = re.escape(" + ".join(case.temperatures)) + " must be positive"

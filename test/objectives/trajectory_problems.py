@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -32,8 +32,12 @@ from torchrl.objectives import HardUpdate
 
 from torchrl_ecpo.objectives import (
     ECPOLoss,
+    GRPOLoss,
     MENTLoss,
     PMDLoss,
+    RLOOLoss,
+    SquaredPMDLoss,
+    TPOLoss,
     TrajectoryGroupLoss,
     UREXLoss,
 )
@@ -257,39 +261,40 @@ def split(batch: TensorDictBase) -> list[list[TensorDictBase]]:
 
 @dataclass
 class Numbers:
-    """One group: a number for each trajectory, ``[K]``."""
+    """One group: a number for each trajectory, ``[K]``; and of each the numbers of its steps."""
 
     returns: Tensor
     log_prob: Tensor
     reference: Tensor
     behaviour: Tensor
+    steps: list[tuple[Tensor, Tensor, Tensor]]
+    """Log-probability, reference, behaviour."""
 
 
-def trajectory_log_prob(actor: ProbabilisticTensorDictSequential, trajectory: TensorDictBase):
-    """The sum over steps, one step after another, of log pi(a_t | s_t)."""
-    total = torch.zeros((), dtype=next(actor.parameters()).dtype)
+def step_log_probs(actor: ProbabilisticTensorDictSequential, trajectory: TensorDictBase) -> Tensor:
+    """``[T]``, one step after another, log pi(a_t | s_t)."""
+    log_probs = []
     for t, step in _steps(actor, trajectory):
         if "write" in trajectory:
             first, _, second, _ = actor.module
             step = second(first(step).set("move", trajectory[:, t]["move"]))
-            for part in ("move", "write"):
-                dist = Categorical(logits=step[f"{part}_logits"])
-                total = total + dist.log_prob(trajectory[:, t][part])
+            dists = {part: Categorical(logits=step[f"{part}_logits"]) for part in ("move", "write")}
+            log_probs.append(sum(d.log_prob(trajectory[:, t][part]) for part, d in dists.items()))
             continue
         dist = actor.get_dist(step)
         if isinstance(dist, CompositeDistribution):
             parts = dist.log_prob(trajectory[:, t])
             assert is_tensor_collection(parts)
-            total = total + parts[("action", "move_log_prob")] + parts["force_log_prob"]
+            log_probs.append(parts[("action", "move_log_prob")] + parts["force_log_prob"])
         else:
-            total = total + dist.log_prob(trajectory[:, t]["action"])
-    return total.squeeze(0)
+            log_probs.append(dist.log_prob(trajectory[:, t]["action"]))
+    return torch.cat(log_probs)
 
 
-def recorded_log_prob(trajectory: TensorDictBase) -> Tensor:
-    """The sum of what the sampler wrote, over steps and over the parts of an action."""
+def recorded_log_probs(trajectory: TensorDictBase) -> Tensor:
+    """``[T]``: what the sampler wrote, the sum over the parts of an action."""
     entries = trajectory.flatten_keys().items()
-    return sum(value.sum() for key, value in entries if key.endswith("log_prob"))  # type: ignore
+    return sum(value.squeeze(0) for key, value in entries if key.endswith("log_prob"))  # type: ignore
 
 
 def numbers(
@@ -298,19 +303,15 @@ def numbers(
     reference: ProbabilisticTensorDictSequential | None = None,
 ) -> Numbers:
     """What the formulas need; the recorded log-probability is the reference's by default."""
-    recorded = torch.stack([recorded_log_prob(t) for t in group])
-    with torch.no_grad():
-        references = (
-            recorded
-            if reference is None
-            else torch.stack([trajectory_log_prob(reference, t) for t in group])
-        )
-    return Numbers(
-        returns=torch.stack([t["next", "reward"].sum() for t in group]),
-        log_prob=torch.stack([trajectory_log_prob(actor, t) for t in group]),
-        reference=references,
-        behaviour=recorded,
-    )
+    steps = []
+    for trajectory in group:
+        recorded = recorded_log_probs(trajectory)
+        with torch.no_grad():
+            of_reference = recorded if reference is None else step_log_probs(reference, trajectory)
+        steps.append((step_log_probs(actor, trajectory), of_reference, recorded))
+    returns = torch.stack([t["next", "reward"].sum() for t in group])
+    totals = (torch.stack([each.sum() for each in kind]) for kind in zip(*steps, strict=True))
+    return Numbers(returns, *totals, steps)
 
 
 def normalise(weights: Tensor) -> Tensor:
@@ -349,6 +350,65 @@ def ment(n: Numbers, *, tau: float) -> tuple[Tensor, Tensor]:
     return -((signal - signal.mean()) * n.log_prob).mean(), uniform
 
 
+def rloo(n: Numbers, *, tau: float) -> tuple[Tensor, Tensor]:
+    """MENT's, the baseline without the trajectory itself."""
+    signal = n.returns - tau * n.log_prob.detach()
+    others = [torch.cat([signal[:k], signal[k + 1 :]]).mean() for k in range(len(signal))]
+    return -((signal - torch.stack(others)) * n.log_prob).mean(), ment(n, tau=tau)[1]
+
+
+def scores(n: Numbers, score: str) -> Tensor:
+    """Returns less their mean, in units of their deviation if there is one."""
+    centred = n.returns - n.returns.mean()
+    return centred / n.returns.std(correction=0).clamp_min(1e-9) if score == "group" else centred
+
+
+def grpo(
+    n: Numbers,
+    *,
+    kl_to_ref_coeff: float,
+    clip_epsilon: float | tuple[float, float],
+    score: str,
+    aggregation: str,
+    ratio: str,
+) -> tuple[Tensor, Tensor]:
+    """min(rho A, clip(rho) A) - beta (e^d - d - 1), added up over steps and trajectories."""
+    low, high = clip_epsilon if isinstance(clip_epsilon, tuple) else (clip_epsilon, clip_epsilon)
+    totals, lengths = [], torch.tensor([float(len(log_prob)) for log_prob, *_ in n.steps])
+    for (log_prob, reference, behaviour), advantage in zip(n.steps, scores(n, score), strict=True):
+        rho = (log_prob - behaviour).exp()
+        if ratio == "trajectory":
+            rho = (rho.prod() ** (1 / len(rho))).expand(len(rho))
+        gain = torch.minimum(rho * advantage, rho.clamp(1 - low, 1 + high) * advantage)
+        penalty = (reference - log_prob).exp() - (reference - log_prob) - 1
+        totals.append((gain - kl_to_ref_coeff * penalty).sum())
+    total, weights = torch.stack(totals), normalise((n.log_prob - n.behaviour).exp()).detach()
+    if aggregation == "token_mean":
+        return -total.sum() / lengths.sum(), weights
+    return -(total / lengths if aggregation == "prompt_mean" else total).mean(), weights
+
+
+def tpo(n: Numbers, *, tau: float, score: str, length_norm: bool) -> tuple[Tensor, Tensor]:
+    """-sum q log p, q ~ pi_bar exp(u / tau) and p ~ pi within the group."""
+    powers = [1 / len(log_prob) if length_norm else 1 for log_prob, *_ in n.steps]
+    q = normalise((scores(n, score) / tau).exp() * n.reference.exp() ** torch.tensor(powers))
+    p = normalise(n.log_prob.exp() ** torch.tensor(powers))
+    return -(q * p.log()).sum(), q
+
+
+def squared_pmd(
+    n: Numbers, *, tau: float, tau_prime: float, normaliser: str
+) -> tuple[Tensor, Tensor]:
+    """(r - tau' log pi_bar - eta log Z - eta log(pi/pi_bar))^2 / (2 eta), eta = tau + tau'."""
+    eta, ratios = tau + tau_prime, normalise((n.reference - n.behaviour).exp())
+    score = n.returns - tau_prime * n.reference
+    value = (ratios * score).sum()
+    if normaliser == "soft":
+        value = eta * (ratios * (score / eta).exp()).sum().log()
+    residual = score - value - eta * (n.log_prob - n.reference)
+    return (ratios * residual**2).sum() / (2 * eta), ratios
+
+
 def reinforce(n: Numbers) -> Tensor:
     """The score function of the return, with the group's mean as baseline."""
     return -((n.returns - n.returns.mean()) * n.log_prob).mean()
@@ -361,10 +421,11 @@ class Case:
     loss: type[TrajectoryGroupLoss]
     temperatures: dict[str, float]
     formula: Callable[..., tuple[Tensor, Tensor]]
+    options: dict[str, Any] = field(default_factory=dict)
 
     def build(self, actor: nn.Module, **kwargs: Any) -> TrajectoryGroupLoss:
         """The loss, in the dtype of the actor, with temperatures exact in that dtype."""
-        loss = self.loss(actor, **self.temperatures, **kwargs)  # type: ignore
+        loss = self.loss(actor, **self.temperatures, **self.options, **kwargs)  # type: ignore
         loss.to(next(actor.parameters()).dtype)
         for name, value in self.temperatures.items():
             setattr(loss, name, value)
@@ -372,7 +433,7 @@ class Case:
 
     def expected(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor]:
         """Loss and weights of one group, by the formula."""
-        return self.formula(numbers(*args, **kwargs), **self.temperatures)
+        return self.formula(numbers(*args, **kwargs), **self.temperatures, **self.options)
 
 
 CASES = {
@@ -380,8 +441,19 @@ CASES = {
     "pmd": Case(PMDLoss, {"tau": 0.7, "tau_prime": 0.3}, pmd),
     "urex": Case(UREXLoss, {"tau": 0.6}, urex),
     "ment": Case(MENTLoss, {"tau": 0.4}, ment),
+    "rloo": Case(RLOOLoss, {"tau": 0.4}, rloo),
+    "grpo": Case(
+        GRPOLoss,
+        {"kl_to_ref_coeff": 0.3},
+        grpo,
+        {"clip_epsilon": 0.1, "score": "group", "aggregation": "prompt_mean", "ratio": "step"},
+    ),
+    "tpo": Case(TPOLoss, {"tau": 0.7}, tpo, {"score": "group", "length_norm": False}),
+    "squared_pmd": Case(
+        SquaredPMDLoss, {"tau": 0.7, "tau_prime": 0.3}, squared_pmd, {"normaliser": "mean"}
+    ),
 }
-LIFTING = ("ecpo", "pmd")
+DELAYED = ("ecpo", "pmd", "grpo", "tpo", "squared_pmd")  # may have a reference of their own
 
 
 def problem(

@@ -33,9 +33,11 @@ from torchrl_ecpo.checks import (
 )
 from torchrl_ecpo.functional import (
     Surrogate,
+    centred,
     effective_sample_size,
     lifted_log_weights,
     self_normalised_weights,
+    standardised,
     uniform_weights,
 )
 from torchrl_ecpo.groups import DONE_KEY, GROUP_KEY
@@ -52,6 +54,8 @@ from torchrl_ecpo.objectives._base import PolicyLoss, Reduction
 
 __all__ = ["LiftProjectLoss", "Steps", "TrajectoryGroupLoss", "TrajectoryGroups"]
 
+SCORES = {"return": centred, "group": standardised}
+"""What a loss may take for the score: returns in their unit, or in their group's deviation."""
 OF_WEIGHTS = ("ESS", "max_weight")
 OF_GROUPS = ("kl_reference_policy", "entropy", "return", "equal_return_groups")
 
@@ -550,8 +554,9 @@ class LiftProjectLoss(TrajectoryGroupLoss):
 
     def lift(self, groups: TrajectoryGroups) -> Tensor:
         """Log-weight ``[*G, K]`` of the lifted policy relative to the reference: Eq. 5."""
+        tau, tau_prime = self.temperatures()
         return lifted_log_weights(
-            groups.returns, groups.reference_log_prob, tau=self.tau, tau_prime=self.tau_prime
+            groups.returns, groups.reference_log_prob, tau=tau, tau_prime=tau_prime
         )
 
 

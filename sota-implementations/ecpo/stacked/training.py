@@ -16,7 +16,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
-from utils import make_loss, make_optimizer, make_run, make_temperatures, reached
+from utils import make_loss, make_optimizer, make_run, make_temperatures, reached, total_loss
 
 from stacked.envs import stack_envs
 from stacked.policies import stack_policies
@@ -101,6 +101,7 @@ class Stack:
         for index, member in enumerate(self.members):
             parts |= {
                 f"run_{index}": member.run,
+                **({f"loss_{index}": member.loss_module} if member.loss_module.losses else {}),
                 f"optimizer_{index}": member.optimizer,
                 f"temperatures_{index}": member.temperatures,
                 f"evaluation_env_{index}": member.task.evaluation_env,
@@ -122,10 +123,11 @@ class Stack:
         all_losses = self._losses(groups)
         for member in self.members:
             member.optimizer.zero_grad()
-        torch.stack([losses["loss_actor"] for losses in all_losses]).sum().backward()
+        runs = zip(all_losses, self.members, strict=True)
+        torch.stack([total_loss(each, run.loss_module) for each, run in runs]).sum().backward()
         for member, losses in zip(self.members, all_losses, strict=True):
             max_norm = member.config.optim.max_grad_norm or float("inf")
-            grad_norm = clip_grad_norm_(member.task.actor.parameters(), max_norm)
+            grad_norm = clip_grad_norm_(member.optimizer.param_groups[0]["params"], max_norm)
             member.metrics = {**losses.detach(), "grad_norm": grad_norm}
             self._check(member)
         for member in self.members:
@@ -179,7 +181,7 @@ def _make_member(directory: Path, config: DictConfig, task: Task, **options: Any
         config,
         task,
         loss_module,
-        make_optimizer(config.optim, task.actor.parameters()),
+        make_optimizer(config.optim, [*task.actor.parameters(), *loss_module.parameters()]),
         make_temperatures(config.loss, loss_module),
         make_run(config, task, directory=directory, **options),
     )
