@@ -4,6 +4,7 @@ from torchrl_ecpo.objectives.actor_critic import ActorCriticLoss, Lift, States
 from torchrl_ecpo.objectives.ecac import DiscreteECACLoss, ECACLoss
 from torchrl_ecpo.objectives.ecpo import ECPOLoss
 from torchrl_ecpo.objectives.ment import MENTLoss
+from torchrl_ecpo.objectives.mpo import MPOLoss
 from torchrl_ecpo.objectives.pmd import PMDLoss
 from torchrl_ecpo.objectives.pmd_ac import DiscretePMDACLoss, PMDACLoss
 from torchrl_ecpo.objectives.trajectory import (
@@ -23,6 +24,7 @@ __all__ = [
     "Lift",
     "LiftProjectLoss",
     "MENTLoss",
+    "MPOLoss",
     "PMDACLoss",
     "PMDLoss",
     "States",
