@@ -17,6 +17,7 @@ from torchrl_ecpo.objectives import (
     PMDLoss,
     TrajectoryGroupLoss,
     TrajectoryGroups,
+    TrustPCLLoss,
     UREXLoss,
 )
 from torchrl_ecpo.schedules import TemperatureScheduler
@@ -41,6 +42,7 @@ __all__ = [
     "TrajectoryGroupCollector",
     "TrajectoryGroupLoss",
     "TrajectoryGroups",
+    "TrustPCLLoss",
     "UREXLoss",
     "UpdaterSequence",
     "make_softmax_policy",

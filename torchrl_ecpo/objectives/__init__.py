@@ -13,6 +13,7 @@ from torchrl_ecpo.objectives.trajectory import (
     TrajectoryGroupLoss,
     TrajectoryGroups,
 )
+from torchrl_ecpo.objectives.trust_pcl import TrustPCLLoss
 from torchrl_ecpo.objectives.urex import UREXLoss
 
 __all__ = [
@@ -31,5 +32,6 @@ __all__ = [
     "Steps",
     "TrajectoryGroupLoss",
     "TrajectoryGroups",
+    "TrustPCLLoss",
     "UREXLoss",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -57,7 +57,7 @@ OF_GROUPS = ("kl_reference_policy", "entropy", "return", "equal_return_groups")
 
 
 class Steps(NamedTuple):
-    """The steps of the trajectories: every field is ``[*G, K, T]``, 0 in padded steps."""
+    """The steps of the trajectories: numbers are ``[*G, K, T]``, 0 in padded steps."""
 
     rewards: Tensor
     log_prob: Tensor
@@ -68,6 +68,9 @@ class Steps(NamedTuple):
     """log beta(a_t | s_t), under the policy that drew the trajectories."""
     mask: Tensor | None
     """True where the step is real; None where all are."""
+    inputs: TensorDictBase | None = None
+    """What networks read, ``[N, T]`` with the N trajectories of all groups in one row; a padded
+    step is a copy of the last real one. Copy it before a network writes into it."""
 
 
 class TrajectoryGroups(NamedTuple):
@@ -166,6 +169,9 @@ class TrajectoryGroupLoss(PolicyLoss):
     :meth:`surrogate` returns. A member without weights declares its own metrics only, or none.
     """
 
+    further_in_keys: Sequence[NestedKey] = ()
+    """Entries that networks of the member's own read from ``groups.steps.inputs``."""
+
     @dataclass
     class _AcceptedKeys:
         """Entries of the input tensordict, all of leading shape ``[*G, K, T]``.
@@ -253,6 +259,7 @@ class TrajectoryGroupLoss(PolicyLoss):
     def _all_in_keys(self) -> list[NestedKey]:
         return [
             *self.actor_network.in_keys,
+            *self.further_in_keys,
             *_as_list(self.tensor_keys.action),
             self._reward_key,
             *_as_list(self.tensor_keys.sample_log_prob),
@@ -339,7 +346,7 @@ class TrajectoryGroupLoss(PolicyLoss):
                 "reference policy of their own."
             )
         rewards = real(reward.squeeze(-1).to(log_prob.dtype))
-        return Steps(rewards, log_prob, reference, behaviour, mask)
+        return Steps(rewards, log_prob, reference, behaviour, mask, inputs)
 
     def _actor_inputs(
         self, tensordict: TensorDictBase, shape: torch.Size, step_mask: Tensor | None
@@ -353,7 +360,8 @@ class TrajectoryGroupLoss(PolicyLoss):
         action_keys = _as_list(self.tensor_keys.action)
         for key in action_keys:
             get_entry(tensordict, key)
-        keys = [*self.actor_network.in_keys, *action_keys, *self._latent_keys]
+        keys = [*self.actor_network.in_keys, *self.further_in_keys]
+        keys += [*action_keys, *self._latent_keys]
         if self._may_squash:
             keys += [key for head in self._heads for key in head.in_keys]
         inputs = tensordict.select(*keys, strict=False)
