@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from faults import NO_NETWORKS, Subject, check, tensordict_of
+from test_trust_pcl import TEMPERATURES, make_value
 from trajectory_problems import CASES, LIFTING, MASK, make_actor, sample
 
-OPTIONS = ("tau", "tau_prime", "delay_actor", "reduction", "control_variate")
+from torchrl_ecpo import TrustPCLLoss
+
+OPTIONS = ("tau", "tau_prime", "delay_actor", "reduction", "control_variate", "gamma", "n_steps")
+NETWORKS = ("actor_network", "value_network")
 SHAPE = (2, 3, 4)
+SUBJECTS = CASES | {"trust_pcl": SimpleNamespace(loss=TrustPCLLoss, temperatures=TEMPERATURES)}
 NAMES = "names of groups, which agree within each"
 FINE = {("group", fault): NAMES for fault in ("text", "complex", "halves", "flags")}
 
@@ -26,9 +33,9 @@ def good(kind, *, dtype=torch.float64):
 def call(case, kind):
     def run(entries):
         options = {name: entries[name] for name in OPTIONS if name in entries}
-        networks = {n: entries[n]() for n in ("actor_network",) if n in entries}
+        networks = {name: entries[name]() for name in NETWORKS if name in entries}
         loss_module = case.loss(**networks, **options)
-        batch = {key: x for key, x in entries.items() if key not in (*OPTIONS, "actor_network")}
+        batch = {key: x for key, x in entries.items() if key not in (*OPTIONS, *NETWORKS)}
         losses = loss_module(tensordict_of(batch, SHAPE))
         losses["loss_actor"].sum().backward()
         gradients = [parameter.grad for parameter in loss_module.parameters()]
@@ -38,23 +45,27 @@ def call(case, kind):
 
 
 def subject(name, kind):
-    case = CASES[name]
+    case = SUBJECTS[name]
     options = {**case.temperatures, "reduction": "none"}
     if name in LIFTING:
         options["delay_actor"] = False
     if name == "ecpo":
         options["control_variate"] = False
-    entries = good(kind) | options | {"actor_network": lambda: make_actor(kind)}
+    if name == "trust_pcl":
+        options |= {"delay_actor": False, "gamma": 0.9, "n_steps": 2}
+    networks = dict.fromkeys(NETWORKS[: 1 + (name == "trust_pcl")], NO_NETWORKS)
+    made = {"actor_network": lambda: make_actor(kind), "value_network": make_value}
+    entries = good(kind) | options | {network: made[network] for network in networks}
     return Subject(
         call(case, kind),
         entries,
-        faults={"actor_network": NO_NETWORKS},
+        faults=networks,
         fine=FINE,
         optional=(MASK, "group", *options),
     )
 
 
 @pytest.mark.parametrize("kind", ["categorical", "normal"])
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", SUBJECTS)
 def test_trajectory_losses(name, kind):
-    check(f"`{CASES[name].loss.__name__}`, {kind} policy", subject(name, kind))
+    check(f"`{SUBJECTS[name].loss.__name__}`, {kind} policy", subject(name, kind))
