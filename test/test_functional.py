@@ -31,6 +31,7 @@ from torchrl_ecpo.functional import (
     mean_seeking_projection,
     ment_surrogate,
     mode_seeking_projection,
+    path_consistency,
     score_function_loss,
     self_normalised_weights,
     soft_value,
@@ -1291,3 +1292,56 @@ def test_differences_of_log_probabilities_may_overflow():
     for loss, weights, *_ in projections:
         assert loss.isfinite()
         assert weights.isfinite().all()
+
+
+# -------------------------------------------------------------------------------- path consistency
+
+
+@DTYPES
+@pytest.mark.parametrize(
+    ("n_steps", "masked", "expected"),
+    [
+        (1, False, (0.0, -0.5, -0.75)),
+        (2, False, (-0.25, -0.875, -0.75)),
+        (9, False, (-0.4375, -0.875, -0.75)),
+        (2, True, (-0.375, -0.75, 0.0)),
+    ],
+)
+def test_path_consistency_by_hand(n_steps, masked, expected, dtype):
+    """Steps gain r + 0.75 - 1 = 0.75, -0.25, -0.25; V is 1, 0.5, 0.5, and half of it later."""
+    log_prob, values = vector(-1, -1, -1, dtype=dtype), vector(1, 0.5, 0.5, dtype=dtype)
+    tensors = [vector(1, 0, 0, dtype=dtype), log_prob, 2 * log_prob, values]
+    mask = torch.tensor([True, True, False]) if masked else None
+    for tensor in tensors if masked else ():
+        tensor[2] = math.nan
+    options = {"tau": 0.5, "tau_prime": 0.25, "gamma": 0.5, "n_steps": n_steps, "mask": mask}
+    assert_close(path_consistency(*tensors, **options), vector(*expected, dtype=dtype))
+
+
+@pytest.mark.parametrize(("tau", "tau_prime"), [(0.5, 0.25), (1.0, 0.0), (0.0, 0.3)])
+@pytest.mark.parametrize("gamma", [1.0, 0.7])
+def test_path_consistency_holds_at_the_optimum_on_every_path(tau, tau_prime, gamma):
+    """V of Eq. 8 and its policy, by enumeration: 3 states, 2 actions, 4 steps; not of others."""
+    generator = torch.Generator().manual_seed(0)
+    reward, logits = torch.randn(2, 3, 2, generator=generator, dtype=torch.float64)
+    reference, following = logits.log_softmax(-1), torch.tensor([[1, 2], [2, 0], [0, 1]])
+    values, policies = [torch.zeros(3).double()], []
+    for _ in range(4):
+        score = reward + gamma * values[0][following]
+        options = {"tau": tau, "tau_prime": tau_prime}
+        values.insert(0, soft_value(score, reference, **options))
+        log_weights = lifted_log_weights(score, reference, **options) + reference
+        policies.insert(0, log_weights.log_softmax(-1))
+    rows = []
+    for actions in itertools.product(range(2), repeat=4):
+        state, row = 0, []
+        for t, action in enumerate(actions):
+            step = reward[state, action], policies[t][state, action], reference[state, action]
+            row.append(torch.stack([*step, values[t][state]]))
+            state = int(following[state, action])
+        rows.append(torch.stack(row, -1))
+    paths = torch.stack(rows, 1)
+    for n_steps in (1, 2, 3, 7):
+        options = {"tau": tau, "tau_prime": tau_prime, "gamma": gamma, "n_steps": n_steps}
+        assert_close(path_consistency(*paths, **options), torch.zeros(16, 4).double())
+        assert (path_consistency(paths[0] + 0.01, *paths[1:], **options) > 0.0099).all()

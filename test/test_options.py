@@ -54,7 +54,7 @@ def split(options):
         ("env=gym env.hidden_sizes=64", "env.hidden_sizes must be a list, got 64."),
         ("env=gym env.hidden_sizes=[64,0]", r"hidden_sizes\[1\] must be an integer >= 1, got 0."),
         ("ecac loss.options.target_entropy=ayto", "must be a number or auto or null, got 'ayto'."),
-        ("loss.tau.start=1", "loss.tau: schedule must be one of"),
+        ("loss.tau.start=1", "loss.tau: .*schedule must be one of"),
         (SCHEDULE.replace("end", "to"), "loss.tau: Wrong arguments for the schedule 'linear'"),
         (SCHEDULE.replace("0", "-1"), "loss.tau.end must be a number >= 0, got -1."),
         # Ranges and choices.

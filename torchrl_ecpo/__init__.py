@@ -13,6 +13,7 @@ from torchrl_ecpo.objectives import (
     Lift,
     LiftProjectLoss,
     MENTLoss,
+    MPOLoss,
     PMDACLoss,
     PMDLoss,
     REPSLoss,
@@ -21,6 +22,7 @@ from torchrl_ecpo.objectives import (
     TPOLoss,
     TrajectoryGroupLoss,
     TrajectoryGroups,
+    TrustPCLLoss,
     UREXLoss,
 )
 from torchrl_ecpo.schedules import TemperatureScheduler
@@ -37,6 +39,7 @@ __all__ = [
     "Lift",
     "LiftProjectLoss",
     "MENTLoss",
+    "MPOLoss",
     "PMDACLoss",
     "PMDLoss",
     "PeriodicCopy",
@@ -49,6 +52,7 @@ __all__ = [
     "TrajectoryGroupCollector",
     "TrajectoryGroupLoss",
     "TrajectoryGroups",
+    "TrustPCLLoss",
     "UREXLoss",
     "UpdaterSequence",
     "make_softmax_policy",

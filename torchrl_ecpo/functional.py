@@ -69,6 +69,7 @@ __all__ = [
     "mean_seeking_projection",
     "ment_surrogate",
     "mode_seeking_projection",
+    "path_consistency",
     "score_function_loss",
     "self_normalised_weights",
     "soft_value",
@@ -753,6 +754,65 @@ def divergence_penalty(log_prob: Tensor, reference_log_prob: Tensor) -> Tensor:
 
 
 # -------------------------------------------------------------------------------- soft values
+
+
+def path_consistency(
+    rewards: Tensor,
+    log_prob: Tensor,
+    reference_log_prob: Tensor,
+    values: Tensor,
+    *,
+    tau: float | Tensor,
+    tau_prime: float | Tensor,
+    gamma: float = 1.0,
+    n_steps: int = 1,
+    mask: Tensor | None = None,
+) -> Tensor:
+    r"""Residual of the soft values along paths of d steps: Trust-PCL (Nachum et al., ICLR 2018).
+
+    .. math::
+        C_t = -V(s_t) + \gamma^d V(s_{t+d}) + \sum_{i<d} \gamma^i \left[ r_{t+i}
+            - (\tau + \tau') \log \pi(a_{t+i}|s_{t+i}) + \tau \log \bar\pi(a_{t+i}|s_{t+i}) \right]
+
+    It is 0 on every path, of any length, if and only if V is the :func:`soft_value` of Eq. 8 and pi
+    its lifted policy (of deterministic problems; of others, in expectation over the next state).
+
+    Args:
+        rewards: ``[*, T]``, of the steps of one trajectory a row, as the other tensors.
+        values: ``[*, T]``, V of the state in which each step begins. Nothing is to come after the
+            last real step, which ends the trajectory.
+        gamma: discount, from 0 to 1.
+        n_steps: d; paths that would be longer than the trajectory end with it.
+        mask: ``[*, T]``, True where a step is real.
+
+    Returns:
+        ``[*, T]``, of the path that begins with each step; 0 where masked.
+
+    Examples:
+        Each step gains r + 0.75 - 1. C = 0.75 + 0.5 * 0.5 - 1, and -0.25 - 0.5:
+
+        >>> log_prob, values = torch.tensor([-1.0, -1.0]), torch.tensor([1.0, 0.5])
+        >>> path_consistency(torch.tensor([1.0, 0.0]), log_prob, 2 * log_prob, values,
+        ...                  tau=0.5, tau_prime=0.25, gamma=0.5)
+        tensor([ 0.0000, -0.7500])
+    """
+    check_temperatures(tau=tau, tau_prime=tau_prime)
+    tensors = {"rewards": rewards, "log_prob": log_prob, "reference_log_prob": reference_log_prob}
+    _check_samples(-1, mask, **tensors, values=values, tau=tau, tau_prime=tau_prime)
+    if not (_is_number(gamma) and 0 <= gamma <= 1):
+        raise ValueError(f"gamma must be a number from 0 to 1, got {gamma!r}.")
+    if not isinstance(n_steps, int) or isinstance(n_steps, bool) or n_steps < 1:
+        raise ValueError(f"n_steps must be an integer of at least 1, got {n_steps!r}.")
+    gains = rewards - (tau + tau_prime) * log_prob + tau * reference_log_prob
+    gains, values = torch.broadcast_tensors(gains, values)
+    if mask is not None:
+        gains, values = gains.where(mask, 0.0), values.where(mask, 0.0)
+    d = min(n_steps, gains.shape[-1])
+    discounts = gamma ** torch.arange(d + 1, dtype=gains.dtype, device=gains.device)
+    paths = torch.nn.functional.pad(gains, (0, d - 1)).unfold(-1, d, 1)
+    later = torch.nn.functional.pad(values, (0, d))[..., d:]
+    residual = (paths * discounts[:-1]).sum(-1) + discounts[-1] * later - values
+    return residual if mask is None else residual.where(mask, 0.0)
 
 
 def soft_value(

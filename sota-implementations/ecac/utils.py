@@ -36,6 +36,7 @@ from torchrl.objectives import DDPGLoss, LossModule, SACLoss, TargetNetUpdater, 
 
 from torchrl_ecpo import (
     ECACLoss,
+    MPOLoss,
     PeriodicCopy,
     PMDACLoss,
     PolyakAverage,
@@ -57,6 +58,7 @@ from torchrl_ecpo.schedules import make_schedule
 LOSSES = {
     "ecac": ECACLoss,
     "pmd_ac": PMDACLoss,
+    "mpo": MPOLoss,
     "sac": SACLoss,
     "sac_score": ScoreSACLoss,
     "td3": TD3Loss,
@@ -206,7 +208,7 @@ def make_temperatures(config: DictConfig, loss_module: LossModule) -> Temperatur
 
 
 def make_updater(config: DictConfig, loss_module: LossModule) -> TargetNetUpdater:
-    """Polyak averages; the reference policy of ECAC and PMD-AC is a copy instead."""
+    """Polyak averages; the reference policy of our losses is a copy instead."""
     delayed = [
         name.removeprefix("target_").removesuffix("_params")
         for name, _ in loss_module.named_children()

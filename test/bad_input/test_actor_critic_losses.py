@@ -21,6 +21,9 @@ OPTIONS = {
     "delay_qvalue": True,
     "target_entropy": None,
     "target_kl": None,
+    "epsilon": 0.2,
+    "epsilon_mean": 0.01,
+    "epsilon_scale": 0.001,
     "reduction": "mean",
 }
 

@@ -42,10 +42,13 @@ GOOD = {
     "horizon": 10.0,
     "num_trajectories": 7,
     "allow_zero": False,
+    "rewards": numbers(3, 4),
+    "gamma": 0.9,
+    "n_steps": 2,
 }
 OPTIONAL = (
     *("mask", "sample_dim", "keepdim", "control_log_prob", "behaviour_log_prob", "allow_zero"),
-    *("base_weights", "normaliser"),
+    *("base_weights", "normaliser", "gamma", "n_steps"),
 )
 NAMES = [name for name in functional.__all__ if name not in ("Surrogate", "check_temperatures")]
 

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from faults import NO_NETWORKS, Subject, check, tensordict_of
+from test_trust_pcl import TEMPERATURES, make_value
 from trajectory_problems import CASES, DELAYED, MASK, Case, ecpo, make_actor, sample
 
-from torchrl_ecpo import REPSLoss
+from torchrl_ecpo import REPSLoss, TrustPCLLoss
 
-LOSSES = {**CASES, "reps": Case(REPSLoss, {"tau": 0.7, "tau_prime": 0.3}, ecpo, {"epsilon": 0.4})}
 OPTIONS = (
     *("tau", "tau_prime", "delay_actor", "reduction", "control_variate", "epsilon", "normaliser"),
     *("clip_epsilon", "score", "aggregation", "ratio", "kl_to_ref_coeff", "length_norm"),
+    *("gamma", "n_steps"),
 )
+NETWORKS = ("actor_network", "value_network")
 SHAPE = (2, 3, 4)
+SUBJECTS = CASES | {
+    "reps": Case(REPSLoss, {"tau": 0.7, "tau_prime": 0.3}, ecpo, {"epsilon": 0.4}),
+    "trust_pcl": SimpleNamespace(loss=TrustPCLLoss, temperatures=TEMPERATURES, options={}),
+}
 NAMES = "names of groups, which agree within each"
-FINE = {("group", fault): NAMES for fault in ("text", "complex", "halves", "flags")}
+FINE = {("group", fault): NAMES for fault in ("text", "halves", "flags")}
 
 
 def good(kind, *, dtype=torch.float64):
@@ -32,9 +40,9 @@ def good(kind, *, dtype=torch.float64):
 def call(case, kind):
     def run(entries):
         options = {name: entries[name] for name in OPTIONS if name in entries}
-        networks = {n: entries[n]() for n in ("actor_network",) if n in entries}
+        networks = {name: entries[name]() for name in NETWORKS if name in entries}
         loss_module = case.loss(**networks, **options)
-        batch = {key: x for key, x in entries.items() if key not in (*OPTIONS, "actor_network")}
+        batch = {key: x for key, x in entries.items() if key not in (*OPTIONS, *NETWORKS)}
         losses = loss_module(tensordict_of(batch, SHAPE))
         sum(losses[name].sum() for name in ("loss_actor", *loss_module.losses)).backward()
         gradients = [parameter.grad for parameter in loss_module.parameters()]
@@ -44,23 +52,27 @@ def call(case, kind):
 
 
 def subject(name, kind):
-    case = LOSSES[name]
+    case = SUBJECTS[name]
     options = {**case.temperatures, **case.options, "reduction": "none"}
     if name in (*DELAYED, "reps"):
         options["delay_actor"] = False
     if name in ("ecpo", "reps"):
         options["control_variate"] = False
-    entries = good(kind) | options | {"actor_network": lambda: make_actor(kind)}
+    if name == "trust_pcl":
+        options |= {"delay_actor": False, "gamma": 0.9, "n_steps": 2}
+    networks = dict.fromkeys(NETWORKS[: 1 + (name == "trust_pcl")], NO_NETWORKS)
+    made = {"actor_network": lambda: make_actor(kind), "value_network": make_value}
+    entries = good(kind) | options | {network: made[network] for network in networks}
     return Subject(
         call(case, kind),
         entries,
-        faults={"actor_network": NO_NETWORKS},
+        faults=networks,
         fine=FINE,
         optional=(MASK, "group", *options),
     )
 
 
 @pytest.mark.parametrize("kind", ["categorical", "normal"])
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", SUBJECTS)
 def test_trajectory_losses(name, kind):
-    check(f"`{LOSSES[name].loss.__name__}`, {kind} policy", subject(name, kind))
+    check(f"`{SUBJECTS[name].loss.__name__}`, {kind} policy", subject(name, kind))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -25,6 +25,7 @@ from torchrl_ecpo import (
     DiscreteECACLoss,
     DiscretePMDACLoss,
     ECACLoss,
+    MPOLoss,
     PMDACLoss,
     PolyakAverage,
 )
@@ -140,6 +141,7 @@ class Case:
 CASES = {
     "ecac": Case(ECACLoss, "tanh_normal"),
     "pmd_ac": Case(PMDACLoss, "tanh_normal", {"num_action_samples": 4}),
+    "mpo": Case(MPOLoss, "tanh_normal", {"epsilon": 0.2, "min_tau": 1e-9}),
     "discrete_ecac": Case(DiscreteECACLoss, "categorical"),
     "discrete_pmd_ac": Case(DiscretePMDACLoss, "one_hot"),
 }
@@ -149,9 +151,10 @@ def out_keys(case: Case, *, value: bool, learned: bool = False) -> list[str]:
     """As documented."""
     losses = ["loss_actor", "loss_qvalue", *(["loss_value"] if value else [])]
     losses += ["loss_tau", "loss_tau_prime"] if learned else []
+    losses += case.loss.losses
     metrics = ["ESS", "kl_target_reference", "kl_reference_policy", "entropy"]
     metrics += [] if case.is_discrete else ["saturation"]
-    return [*losses, *metrics, "qvalue", "state_value", "tau", "tau_prime"]
+    return [*losses, *metrics, "qvalue", "state_value", *case.loss.metrics, "tau", "tau_prime"]
 
 
 def total(losses: TensorDictBase) -> Tensor:
@@ -312,6 +315,29 @@ def chosen_qvalues(kind: str, qvalues: list[TensorDictModule], batch: TensorDict
     return torch.stack([values[:, i, a] for i, a in enumerate(action)], -1)
 
 
+def mpo_outputs(case: Case, actor, reference, observation: Tensor, lifted: Lifted):
+    """The M-step, at multipliers of 1, and what is learned beside it."""
+    (loc, scale), (old_loc, old_scale) = (
+        [each[0](_observing(observation))[key] for key in ("loc", "scale")]
+        for each in (actor, reference)
+    )
+    of_mean = 0.5 * ((loc - old_loc) / old_scale) ** 2
+    of_scale = 0.5 * (old_scale / scale) ** 2 - 0.5 + (scale / old_scale).log()
+    fit_mean = 0.5 * ((lifted.latent - loc) / old_scale) ** 2 + old_scale.log()
+    fit_scale = 0.5 * ((lifted.latent - old_loc) / scale) ** 2 + scale.log()
+    each = (fit_mean + fit_scale + math.log(2 * math.pi)).sum(-1)
+    divergence = (lifted.weights * (lifted.weights * len(lifted.weights)).log()).sum(0)
+    one = torch.ones_like(divergence)
+    return {
+        "loss_actor": (lifted.weights * each).sum(0) + of_mean.sum(-1) + of_scale.sum(-1),
+        "loss_tau": -math.log(case.tau) * (divergence / case.options["epsilon"] - 1),
+        "kl_mean": of_mean.sum(-1),
+        "kl_scale": of_scale.sum(-1),
+        **dict.fromkeys(("loss_alpha_mean", "loss_alpha_scale"), 0 * one),
+        **dict.fromkeys(("alpha_mean", "alpha_scale"), one),
+    }
+
+
 def expected_outputs(
     case: Case,
     new: Networks,
@@ -331,7 +357,8 @@ def expected_outputs(
     def lift(qvalues: list[TensorDictModule], observation: Tensor, m: int) -> Lifted:
         if case.is_discrete:
             return lift_by_summation(reference, qvalues, observation, **temperatures)
-        return lift_by_samples(reference, qvalues, observation, m, **temperatures)
+        lifted = lift_by_samples(reference, qvalues, observation, m, **temperatures)
+        return replace(lifted, value=lifted.score.mean(0)) if case.loss is MPOLoss else lifted
 
     with torch.no_grad():
         if value:
@@ -357,6 +384,9 @@ def expected_outputs(
         lifted = lift(new.qvalues, state, num_action_samples)
         loss = case.tau * divergence + case.tau_prime * log_prob - score
         outputs["loss_actor"] = loss.squeeze(0)
+    elif case.loss is MPOLoss:
+        lifted = lift(new.qvalues, state, num_action_samples)
+        outputs |= mpo_outputs(case, new.actor, reference, state, lifted)
     else:
         lifted = lift(new.qvalues, state, num_action_samples)
         if case.is_discrete:

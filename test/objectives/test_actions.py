@@ -127,7 +127,7 @@ def test_policies_that_are_no_diagonal_gaussians(name):
     assert_close(actions.log_prob, policy.log_prob(actions.action))
     assert_close(actions.log_prob_of(policy), actions.log_prob)
     kind = type(policy).__name__
-    message = f'projection="centred" needs a diagonal Gaussian.*got {kind}.*Use projection="paper"'
+    message = f'needs a diagonal Gaussian.*got {kind}.*projection="paper".* takes any'
     with pytest.raises(ValueError, match=message):
         gaussian_parameters(policy)
 

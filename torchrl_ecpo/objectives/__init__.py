@@ -5,6 +5,7 @@ from torchrl_ecpo.objectives.ecac import DiscreteECACLoss, ECACLoss
 from torchrl_ecpo.objectives.ecpo import ECPOLoss
 from torchrl_ecpo.objectives.grpo import GRPOLoss
 from torchrl_ecpo.objectives.ment import MENTLoss
+from torchrl_ecpo.objectives.mpo import MPOLoss
 from torchrl_ecpo.objectives.pmd import PMDLoss
 from torchrl_ecpo.objectives.pmd_ac import DiscretePMDACLoss, PMDACLoss
 from torchrl_ecpo.objectives.reps import REPSLoss
@@ -17,6 +18,7 @@ from torchrl_ecpo.objectives.trajectory import (
     TrajectoryGroupLoss,
     TrajectoryGroups,
 )
+from torchrl_ecpo.objectives.trust_pcl import TrustPCLLoss
 from torchrl_ecpo.objectives.urex import UREXLoss
 
 __all__ = [
@@ -29,6 +31,7 @@ __all__ = [
     "Lift",
     "LiftProjectLoss",
     "MENTLoss",
+    "MPOLoss",
     "PMDACLoss",
     "PMDLoss",
     "REPSLoss",
@@ -39,5 +42,6 @@ __all__ = [
     "TPOLoss",
     "TrajectoryGroupLoss",
     "TrajectoryGroups",
+    "TrustPCLLoss",
     "UREXLoss",
 ]

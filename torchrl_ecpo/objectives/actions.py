@@ -218,8 +218,8 @@ def gaussian_parameters(distribution: Distribution) -> tuple[Tensor, Tensor]:
     normal = base.base_dist if isinstance(base, Independent) else base
     if not isinstance(normal, Normal):
         raise ValueError(
-            'projection="centred" needs a diagonal Gaussian policy, transformed (TanhNormal) or '
-            f'not, got {type(distribution).__name__}. Use projection="paper", which takes any.'
+            "This projection needs a diagonal Gaussian policy, transformed (TanhNormal) or not, "
+            f'got {type(distribution).__name__}. ECACLoss(projection="paper") takes any.'
         )
     return normal.loc, normal.scale
 

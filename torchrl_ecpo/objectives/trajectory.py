@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -61,7 +61,7 @@ OF_GROUPS = ("kl_reference_policy", "entropy", "return", "equal_return_groups")
 
 
 class Steps(NamedTuple):
-    """The steps of the trajectories: every field is ``[*G, K, T]``, 0 in padded steps."""
+    """The steps of the trajectories: numbers are ``[*G, K, T]``, 0 in padded steps."""
 
     rewards: Tensor
     log_prob: Tensor
@@ -72,6 +72,9 @@ class Steps(NamedTuple):
     """log beta(a_t | s_t), under the policy that drew the trajectories."""
     mask: Tensor | None
     """True where the step is real; None where all are."""
+    inputs: TensorDictBase | None = None
+    """What networks read, ``[N, T]`` with the N trajectories of all groups in one row; a padded
+    step is a copy of the last real one. Copy it before a network writes into it."""
 
 
 class TrajectoryGroups(NamedTuple):
@@ -170,6 +173,9 @@ class TrajectoryGroupLoss(PolicyLoss):
     :meth:`surrogate` returns. A member without weights declares its own metrics only, or none.
     """
 
+    further_in_keys: Sequence[NestedKey] = ()
+    """Entries that networks of the member's own read from ``groups.steps.inputs``."""
+
     @dataclass
     class _AcceptedKeys:
         """Entries of the input tensordict, all of leading shape ``[*G, K, T]``.
@@ -257,6 +263,7 @@ class TrajectoryGroupLoss(PolicyLoss):
     def _all_in_keys(self) -> list[NestedKey]:
         return [
             *self.actor_network.in_keys,
+            *self.further_in_keys,
             *_as_list(self.tensor_keys.action),
             self._reward_key,
             *_as_list(self.tensor_keys.sample_log_prob),
@@ -343,7 +350,7 @@ class TrajectoryGroupLoss(PolicyLoss):
                 "reference policy of their own."
             )
         rewards = real(reward.squeeze(-1).to(log_prob.dtype))
-        return Steps(rewards, log_prob, reference, behaviour, mask)
+        return Steps(rewards, log_prob, reference, behaviour, mask, inputs)
 
     def _actor_inputs(
         self, tensordict: TensorDictBase, shape: torch.Size, step_mask: Tensor | None
@@ -357,7 +364,8 @@ class TrajectoryGroupLoss(PolicyLoss):
         action_keys = _as_list(self.tensor_keys.action)
         for key in action_keys:
             get_entry(tensordict, key)
-        keys = [*self.actor_network.in_keys, *action_keys, *self._latent_keys]
+        keys = [*self.actor_network.in_keys, *self.further_in_keys]
+        keys += [*action_keys, *self._latent_keys]
         if self._may_squash:
             keys += [key for head in self._heads for key in head.in_keys]
         inputs = tensordict.select(*keys, strict=False)
@@ -493,10 +501,11 @@ class TrajectoryGroupLoss(PolicyLoss):
         """
         faults = {}
         done, group = (tensordict.get(key, None) for key in (DONE_KEY, GROUP_KEY))
-        if done is not None and done.numel() == real.numel():
+        if isinstance(done, Tensor) and done.numel() == real.numel():
             done = done.reshape(real.shape).bool()
             faults[f"go on after an end ({DONE_KEY!r})"] = done[..., :-1] & real[..., 1:]
-        if group is not None and group.numel() == real.numel():
+        if isinstance(group, Tensor) and group.numel() == real.numel():
+            check_real(GROUP_KEY, group)
             group = group.reshape(real.shape)
             first = group.where(real, group.max()).amin((-2, -1), keepdim=True)
             other = (group != first) & real
