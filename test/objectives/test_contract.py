@@ -398,8 +398,8 @@ def test_modes_inside_and_after():
 @pytest.mark.parametrize(
     "backend",
     [
-        "aot_eager",  # all that the compiler does before it generates code
-        pytest.param("eager", marks=pytest.mark.slow),
+        "eager",  # the graph is whole; then its backward pass, then code
+        pytest.param("aot_eager", marks=pytest.mark.slow),
         pytest.param("inductor", marks=pytest.mark.slow),
     ],
 )

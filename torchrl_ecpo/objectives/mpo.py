@@ -38,7 +38,7 @@ class MPOLoss(ActorCriticLoss):
 
     The dual's derivative is :math:`\epsilon - D_{KL}(w \| \bar\pi)`: tau is learned as each
     multiplier alpha is, up where its divergence exceeds its bound, else down, in log-space
-    (:meth:`dual`, of the divergence in units of its bound less 1). So tau goes where ECAC's does
+    (``dual``, of the divergence in units of its bound less 1). So tau goes where ECAC's does
     with ``target_kl`` = epsilon / A. While the policy is the reference the gradients of mean and
     scale are those of ``ECACLoss(projection="paper")``; the farther it is, the more the bounds say.
 
