@@ -350,6 +350,10 @@ def test_what_reps_refuses():
     for epsilon in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(ValueError, match=f"epsilon must be above 0, in nats, got {epsilon}"):
             REPSLoss(make_actor(), epsilon=epsilon)
+    with pytest.raises(
+        ValueError, match=r"epsilon must be below log K = 1\.1, .* of 3 goes, got 1\.2"
+    ):
+        REPSLoss(make_actor(), epsilon=1.2)(sample(make_actor(), 2, 3, 4))
     loss = REPSLoss(make_actor())
     with pytest.raises(AttributeError, match="tau is learned"):
         loss.tau = 0.5

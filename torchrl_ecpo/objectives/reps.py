@@ -33,13 +33,16 @@ class REPSLoss(ECPOLoss):
         actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.
 
     Keyword Args:
-        epsilon: how far the lift goes, in nats; above 0, and less than log K. Defaults to 0.5
+        epsilon: how far the lift goes, in nats; above 0, and below log K. Defaults to 0.5
             (ours).
         tau: where the temperature starts. Defaults to 1.
         tau_prime: temperature of the entropy. Defaults to 0 (REPS has none).
         control_variate: see :class:`ECPOLoss`. Defaults to False.
         delay_actor: see :class:`ECPOLoss`. Defaults to False.
         reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
+
+    Raises:
+        ValueError: also for an epsilon that is not above 0, or, when called, not below log K.
 
     Examples:
         >>> import torch
@@ -82,6 +85,12 @@ class REPSLoss(ECPOLoss):
 
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
         """ECPO's, at the temperature that has been found."""
+        size = groups.returns.shape[-1]
+        if self.epsilon >= math.log(size):
+            raise ValueError(
+                f"epsilon must be below log K = {math.log(size):.3g}, which is as far as a lift of "
+                f"groups of {size} goes, got {self.epsilon}."
+            )
         projection = super().surrogate(groups)
         assert projection.weights is not None
         log_base = groups.reference_log_prob - groups.behaviour_log_prob
