@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDictBase, is_non_tensor, is_tensor_collection
+from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
@@ -42,6 +43,14 @@ def check_kind(name: str, value: Any, *kinds: Any) -> None:
     if not isinstance(value, kinds):
         expected = " or ".join("None" if kind is NoneType else kind.__name__ for kind in kinds)
         raise TypeError(f"{name} must be a {expected}, got {described(value)}.")
+
+
+def check_network(name: str, network: Any) -> None:
+    """Refuse what reads no entries."""
+    if not isinstance(network, TensorDictModuleBase):
+        raise TypeError(
+            f"{name} must be a TensorDictModule, such as ValueOperator, got {network!r:.60}."
+        )
 
 
 def check_keys(name: str, keys: Any) -> list[Any]:
@@ -185,3 +194,11 @@ def as_float(name: str, value: Any) -> float:
         return float(value)
     except (TypeError, ValueError, RuntimeError):
         raise ValueError(f"{name} must be a number, got {value!r}.") from None
+
+
+def as_fraction(name: str, value: Any) -> float:
+    """A number from 0 to 1, such as a discount."""
+    number = as_float(name, value)
+    if not 0 <= number <= 1:
+        raise ValueError(f"{name} must be in [0, 1], got {number}.")
+    return number

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from torchrl_ecpo.checks import as_float
+from torchrl_ecpo.checks import as_fraction
 
 __all__ = [
     "draw_curve",
@@ -52,8 +52,7 @@ def smooth(values: np.ndarray, fraction: float = 0.02) -> np.ndarray:
         >>> smooth(np.array([0.0, 2.0, 4.0, 6.0]), fraction=0.5).tolist()
         [0.0, 1.0, 3.0, 5.0]
     """
-    if not 0 <= as_float("fraction", fraction) <= 1:
-        raise ValueError(f"fraction, of the smoothing, must be in [0, 1], got {fraction}.")
+    fraction = as_fraction("fraction, of the smoothing,", fraction)
     window = max(int(len(values) * fraction), 1)
     sums = np.cumsum(np.concatenate([np.zeros(1), values]))
     ends = np.arange(1, len(values) + 1)

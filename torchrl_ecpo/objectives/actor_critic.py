@@ -13,7 +13,6 @@ from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
-    TensorDictModuleBase,
     dispatch,
 )
 from tensordict.utils import NestedKey, unravel_key
@@ -28,9 +27,11 @@ from torchrl.objectives.value.advantages import ValueEstimatorBase
 from torchrl_ecpo.checks import (
     UNREADABLE,
     as_float,
+    as_fraction,
     check_choice,
     check_count,
     check_flag,
+    check_network,
     check_real,
     get_entry,
     unreadable,
@@ -229,7 +230,7 @@ class ActorCriticLoss(PolicyLoss):
     ) -> None:
         is_list = isinstance(qvalue_network, (list, tuple))
         for network in qvalue_network if is_list else [qvalue_network]:
-            _check_network("qvalue_network", network)
+            check_network("qvalue_network", network)
         if is_list:
             different = len({id(network) for network in qvalue_network})
             if not 2 <= different == len(qvalue_network) == num_qvalue_nets:
@@ -242,7 +243,7 @@ class ActorCriticLoss(PolicyLoss):
         if value_network is None:
             self.value_network = None
         else:
-            _check_network("value_network", value_network)
+            check_network("value_network", value_network)
             self.convert_to_functional(value_network, "value_network", create_target_params=True)
         self.convert_to_functional(
             qvalue_network,  # pyright: ignore[reportArgumentType] - a list is allowed
@@ -595,9 +596,7 @@ class ActorCriticLoss(PolicyLoss):
         """
         for name in ("gamma", "lmbda"):
             if name in hyperparams:
-                hyperparams[name] = as_float(name, hyperparams[name])
-                if not 0 <= hyperparams[name] <= 1:
-                    raise ValueError(f"{name} must be in [0, 1], got {hyperparams[name]}.")
+                hyperparams[name] = as_fraction(name, hyperparams[name])
         value_type = self.default_value_estimator if value_type is None else value_type
         if isinstance(value_type, (ValueEstimators, str)):
             supported = self.SUPPORTED_VALUE_ESTIMATORS
@@ -828,10 +827,3 @@ def _written(outputs: TensorDictBase, name: str, key: NestedKey, network: Any) -
             f"that out_key, or name another with set_keys({name}=...)."
         )
     return value
-
-
-def _check_network(name: str, network: Any) -> None:
-    if not isinstance(network, TensorDictModuleBase):
-        raise TypeError(
-            f"{name} must be a TensorDictModule, such as ValueOperator, got {network!r:.60}."
-        )

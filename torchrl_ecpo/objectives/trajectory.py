@@ -316,13 +316,15 @@ class TrajectoryGroupLoss(PolicyLoss):
         reward = get_entry(tensordict, self._reward_key)
         shape = _batch_shape(reward, self._reward_key)
         mask = self._mask(tensordict, shape)
-        if mask is not None and values_can_be_seen():
-            self._check_mask(mask)
-        every = torch.ones(shape, dtype=torch.bool, device=reward.device) if mask is None else mask
-        if values_can_be_seen() and self._lacks_time(tensordict, every):
-            steps = tensordict.copy()
-            steps.batch_size = shape
-            return self._read_steps(steps.unsqueeze(-1))
+        if values_can_be_seen():
+            real_steps = torch.ones(shape, dtype=torch.bool, device=reward.device)
+            if mask is not None:
+                self._check_mask(mask)
+                real_steps = mask
+            if self._lacks_time(tensordict, real_steps):
+                steps = tensordict.copy()
+                steps.batch_size = shape
+                return self._read_steps(steps.unsqueeze(-1))
 
         def real(values: Tensor) -> Tensor:
             # A sum over a completion of 1,000 tokens would be off by nats in half precision, and

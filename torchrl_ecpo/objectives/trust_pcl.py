@@ -6,11 +6,18 @@ from dataclasses import dataclass
 from typing import Any
 
 from tensordict import TensorDictParams
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_ecpo.checks import UNREADABLE, as_float, check_count, get_entry, unreadable
+from torchrl_ecpo.checks import (
+    UNREADABLE,
+    as_fraction,
+    check_count,
+    check_network,
+    get_entry,
+    unreadable,
+)
 from torchrl_ecpo.functional import Surrogate, masked_mean, path_consistency
 from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, Steps, TrajectoryGroups
 
@@ -112,14 +119,8 @@ class TrustPCLLoss(LiftProjectLoss):
     ) -> None:
         temperatures = {"tau": tau, "tau_prime": tau_prime}
         super().__init__(actor_network, **temperatures, delay_actor=delay_actor, **options)
-        if not isinstance(value_network, TensorDictModuleBase):
-            raise TypeError(
-                "value_network must be a TensorDictModule, such as ValueOperator, got "
-                f"{value_network!r:.60}."
-            )
-        self.gamma = as_float("gamma", gamma)
-        if not 0 <= self.gamma <= 1:
-            raise ValueError(f"gamma must be in [0, 1], got {gamma}.")
+        check_network("value_network", value_network)
+        self.gamma = as_fraction("gamma", gamma)
         self.n_steps = check_count("n_steps", n_steps)
         self.convert_to_functional(value_network, "value_network")
         self.further_in_keys = tuple(value_network.in_keys)
