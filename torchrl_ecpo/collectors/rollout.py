@@ -7,6 +7,7 @@ trajectories together; the environment has the batch size `[*B, K]`, `N = prod(B
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from contextlib import nullcontext
 from typing import Any, NamedTuple
 
 import torch
@@ -172,7 +173,8 @@ class GroupPlayer:
         """Return a batch of groups `[G, K, T]`, with zeros after the end of a trajectory."""
         steps: list[_Step] = []
         groups: list[Tensor] = []
-        with set_exploration_type(self.exploration_type):
+        constant_weights = getattr(self.policy, "constant_weights", nullcontext)
+        with set_exploration_type(self.exploration_type), constant_weights():
             for _ in range(self.num_groups * self.group_size // self.env.batch_size.numel()):
                 groups.append(self._play_round(steps, sum(map(len, groups))))
         assert self._flow is not None

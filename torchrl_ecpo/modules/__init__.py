@@ -11,10 +11,12 @@ from torchrl_ecpo.modules.latents import record_latents
 from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
 from torchrl_ecpo.modules.softmax import LinearSoftmax, SharedCategorical, make_softmax_policy
 from torchrl_ecpo.modules.tuple_policy import TupleCategorical, make_tuple_policy
+from torchrl_ecpo.modules.windows import DistinctWindowNetwork
 
 __all__ = [
     "DenseNetwork",
     "DistinctHistoryLSTM",
+    "DistinctWindowNetwork",
     "LinearSoftmax",
     "SharedCategorical",
     "TupleCategorical",

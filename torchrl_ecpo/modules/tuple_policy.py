@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from copy import copy
 from typing import Any
 
 import torch
@@ -16,7 +18,9 @@ from torchrl.envs import ExplorationType, exploration_type
 from torchrl.modules import LSTMModule, ProbabilisticActor
 
 from torchrl_ecpo.checks import check_count, check_counts, check_flag, check_kind, described
+from torchrl_ecpo.modules.distinct import DistinctCore, Evaluated, take_rows
 from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
+from torchrl_ecpo.modules.windows import DistinctWindowNetwork
 
 __all__ = ["TupleCategorical", "make_tuple_policy"]
 
@@ -44,8 +48,10 @@ class TupleCategorical(Distribution):
     `B` is any batch shape. Logits of any finite size give finite entropies and no NaN.
 
     Args:
-        logits: `[*B, L]`, unnormalised; L = sum(nvec).
+        logits: `[*B, L]`, unnormalised; L = sum(nvec). With `rows`, `[n, L]`.
         nvec: the number of moves, of write flags (2) and of characters.
+        rows: int64 `[*B]`, which of n rows of logits each element has: what depends on the logits
+            alone is computed once for each. Default None: there is one for each element.
         validate_args: whether NaN logits and actions out of range are refused. Default True; False
             saves the checks, and on a GPU their synchronisation.
 
@@ -67,7 +73,13 @@ class TupleCategorical(Distribution):
     arg_constraints: dict = {"logits": constraints.real_vector}  # noqa: RUF012 - as torch has it
     support: constraints.Constraint = constraints.independent(constraints.nonnegative_integer, 1)
 
-    def __init__(self, logits: Tensor, nvec: Sequence[int], validate_args: bool = True) -> None:
+    def __init__(
+        self,
+        logits: Tensor,
+        nvec: Sequence[int],
+        validate_args: bool = True,
+        rows: Tensor | None = None,
+    ) -> None:
         size = _num_logits(nvec)
         check_kind("logits", logits, Tensor)
         if logits.shape[-1:] != (size,) or not logits.is_floating_point():
@@ -79,13 +91,27 @@ class TupleCategorical(Distribution):
             raise ValueError(
                 "logits: expected numbers, got NaN or infinity; the network's weights may be NaN."
             )
-        self.nvec, self.logits = tuple(nvec), logits
+        self.nvec, self._table, self._rows = tuple(nvec), logits, rows
+        batch_shape = logits.shape[:-1] if rows is None else rows.shape
         # The base class would check the same constraint, at several times the cost.
-        super().__init__(logits.shape[:-1], torch.Size([3]), validate_args=False)
+        super().__init__(batch_shape, torch.Size([3]), validate_args=False)
         self._validate_args = validate_args
 
+    @lazy_property
+    def logits(self) -> Tensor:
+        """`[*B, L]`."""
+        return self._of_rows(self._table)
+
+    def at(self, rows: Tensor) -> TupleCategorical:
+        """The distribution with other `rows` of the same logits; nothing is computed again."""
+        other: Any = copy(self)
+        other.__dict__.pop("logits", None)
+        other._rows, other._batch_shape = rows, rows.shape
+        other._log_probs, other._bounds = self._log_probs, self._bounds
+        return other
+
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
-        """Draw actions by the Gumbel-max trick, in one pass over the logits.
+        """Draw actions, each part by inverting its distribution function.
 
         Args:
             sample_shape: the shape of the sample, before the batch shape.
@@ -93,23 +119,23 @@ class TupleCategorical(Distribution):
         Returns:
             int64 `[*sample_shape, *B, 3]`.
         """
-        logits = self.logits
         # Numbers of half precision are so coarse that 0 is among a few hundred.
-        dtype = torch.promote_types(logits.dtype, torch.float32)
-        shape = (*sample_shape, *logits.shape)
-        return self.choose(torch.rand(shape, dtype=dtype, device=logits.device))
+        dtype = torch.promote_types(self._table.dtype, torch.float32)
+        shape = (*sample_shape, *self.batch_shape, 3)
+        return self.choose(torch.rand(shape, dtype=dtype, device=self._table.device))
 
     def choose(self, uniform: Tensor) -> Tensor:
         """Draw actions with given randomness.
 
         Args:
-            uniform: drawn uniformly from [0, 1), `[*sample_shape, *B, L]`; overwritten.
+            uniform: drawn uniformly from [0, 1), `[*sample_shape, *B, 3]`.
 
         Returns:
             int64 `[*sample_shape, *B, 3]`.
         """
-        gumbel = uniform.log_().neg_().log_()  # its negative
-        choice = self._factors(self.logits.detach() - gumbel).argmax(-1)
+        bounds = self._of_rows(self._bounds).to(uniform.dtype)
+        bounds = bounds.expand(*uniform.shape, -1).contiguous()
+        choice = torch.searchsorted(bounds, uniform.unsqueeze(-1), right=True).squeeze(-1)
         choice[..., 2].mul_(choice[..., 1])
         return choice
 
@@ -132,7 +158,7 @@ class TupleCategorical(Distribution):
         _, write, character = self._log_probs.unbind(-2)
         choice[..., 1] = write[..., 1] + character.amax(-1) > write[..., 0]
         choice[..., 2].mul_(choice[..., 1])
-        return choice
+        return self._of_rows(choice)
 
     deterministic_sample = mode  # which `ExplorationType.DETERMINISTIC` asks for
 
@@ -154,44 +180,54 @@ class TupleCategorical(Distribution):
 
     def _score(self, value: Tensor) -> Tensor:
         """Log-probability of actions within range."""
-        index, log_probs = value, self._log_probs
-        if index.shape[:-1] != self.batch_shape:
+        log_probs, rows = self._log_probs, self._rows
+        shape = value.shape[:-1]
+        if shape != self.batch_shape:
             try:
-                shape = torch.broadcast_shapes(index.shape[:-1], self.batch_shape)
+                shape = torch.broadcast_shapes(shape, self.batch_shape)
             except RuntimeError:
                 raise ValueError(
                     f"action: expected the batch shape {tuple(self.batch_shape)} of the logits, "
-                    f"got {tuple(index.shape[:-1])}."
+                    f"got {tuple(value.shape[:-1])}."
                 ) from None
-            log_probs = log_probs.expand(*shape, *log_probs.shape[-2:])
-            index = index.expand(*shape, -1)
-        move, write, character = log_probs.gather(-1, index.unsqueeze(-1)).squeeze(-1).unbind(-1)
-        return move + write + torch.where(value[..., 1] == 1, character, 0)
+        if rows is None:
+            rows = torch.arange(self.batch_shape.numel(), device=value.device)
+            rows = rows.view(self.batch_shape)
+        factors, width = log_probs.shape[-2:]
+        first = rows.unsqueeze(-1) * factors + torch.arange(factors, device=value.device)
+        index = (first * width + value).expand(*shape, -1)
+        move, write, character = take_rows(log_probs.flatten(), index).unbind(-1)
+        return move + write + character.where(value[..., 1] == 1, 0)
 
     def entropy(self) -> Tensor:
         """Exact entropy of the tuple, in nats, `[*B]`."""
         move, write, character = (-(self._log_probs.exp() * self._log_probs).sum(-1)).unbind(-1)
-        return move + write + character * self._log_probs[..., 1, 1].exp()
+        return self._of_rows(move + write + character * self._log_probs[..., 1, 1].exp())
+
+    def _of_rows(self, values: Tensor) -> Tensor:
+        """Of each element `[*B, *]`, from those of the rows of logits."""
+        return values if self._rows is None else take_rows(values, self._rows)
 
     @lazy_property
     def _log_probs(self) -> Tensor:
-        """Normalised log-probabilities of each factor, `[*B, 3, n]`."""
+        """Normalised log-probabilities of each factor, of each row of logits: `[*, 3, n]`."""
         # The floor keeps 0 * log 0 at 0, for the padding and where a difference of logits
         # overflows.
-        floor = torch.finfo(self.logits.dtype).min
+        floor = torch.finfo(self._table.dtype).min
+        width = max(self.nvec)
+        parts = self._table.split(self.nvec, -1)
+        padded = [F.pad(part, (0, width - part.shape[-1]), value=-torch.inf) for part in parts]
+        factors = torch.stack(padded, -2)
         # On few classes log_softmax takes two to four times as long.
-        factors = self._factors(self.logits)
         return (factors - factors.logsumexp(-1, keepdim=True)).clamp(min=floor)
 
-    def _factors(self, values: Tensor) -> Tensor:
-        """Values of each logit `[..., L]`, by factor, padded with -inf: `[..., 3, n]`."""
-        width = max(self.nvec)
-        if min(self.nvec) < width:
-            parts = values.split(self.nvec, -1)
-            values = torch.cat(
-                [F.pad(part, (0, width - part.shape[-1]), value=-torch.inf) for part in parts], -1
-            )
-        return values.unflatten(-1, (3, width))
+    @lazy_property
+    def _bounds(self) -> Tensor:
+        """The distribution function of each factor, of each row of logits: `[*, 3, n]`."""
+        log_probs = self._log_probs.detach()
+        bounds = log_probs.to(torch.promote_types(log_probs.dtype, torch.float32)).exp().cumsum(-1)
+        # The last bound is 1 whatever the rounding, and so are those of the padding.
+        return bounds / bounds[..., -1:]
 
     def _check_range(self, action: Tensor) -> None:
         check_kind("action", action, Tensor)
@@ -213,13 +249,15 @@ def make_tuple_policy(
     nvec: Sequence[int],
     *,
     hidden_size: int = 128,
+    window: int | None = None,
     distinct_histories: bool = True,
     device: torch.device | str | None = None,
     dtype: torch.dtype | None = None,
 ) -> ProbabilisticActor:
-    """Build the recurrent policy of the algorithmic tasks.
+    """Build the policy of the algorithmic tasks.
 
-    One-hot observation and previous action, an LSTM, a linear head, :class:`TupleCategorical`. It
+    One-hot observation and previous action, an LSTM or a window of the last steps with a hidden
+    layer (ReLU), a linear head, :class:`TupleCategorical`. It
     reads `observation` (int64 `[*B]`, below `num_observations`), `previous_action` (int64 `[*B,
     3]`, below nvec + 1: the last class of each means that there is none yet) and `is_init` (of
     `torchrl.envs.InitTracker`), and writes `logits`, `action` (int64 `[*B, 3]`) and
@@ -228,7 +266,9 @@ def make_tuple_policy(
     Args:
         num_observations: the number of observations, the blank included.
         nvec: the number of moves, of write flags (2) and of characters.
-        hidden_size: of the LSTM. Default 128 (the UREX paper's).
+        hidden_size: of the LSTM, or of the hidden layer. Default 128 (the UREX paper's).
+        window: how many steps a policy without LSTM sees, 1 for the present one alone
+            (:class:`DistinctWindowNetwork`). Default None: the LSTM.
         distinct_histories: whether rows with equal histories are computed once
             (:class:`DistinctHistoryLSTM`), or each row by :class:`torchrl.modules.LSTMModule`. The
             numbers and the order of the parameters are the same.
@@ -270,7 +310,17 @@ def make_tuple_policy(
     factory: dict[str, Any] = {"device": device, "dtype": dtype}
     core: Any
     readout = nn.Linear(hidden_size, _num_logits(nvec), **factory)
-    if check_flag("distinct_histories", distinct_histories):
+    if window is not None:
+        core = DistinctWindowNetwork(
+            num_classes,
+            hidden_size,
+            window,
+            nn.Sequential(nn.ReLU(), readout),
+            in_keys=inputs,
+            out_key="logits",
+            **factory,
+        )
+    elif check_flag("distinct_histories", distinct_histories):
         core = DistinctHistoryLSTM(
             num_classes,
             hidden_size,
@@ -299,27 +349,59 @@ def make_tuple_policy(
 
 
 class _TupleActor(ProbabilisticActor):
-    """Samples in one pass; whatever else is asked of it goes the way of its base class.
+    """Evaluates distribution and sample once for each distinct past.
 
-    That way costs as much as the LSTM over a few distinct histories.
+    Whatever else is asked of it goes the way of its base class, which costs as much as the LSTM
+    over a few distinct histories.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.all_out_keys = list(self.out_keys)
+        self._known: TupleCategorical | None = None
+
+    @contextmanager
+    def constant_weights(self) -> Iterator[None]:
+        """Within, the weights do not change: what depends on them alone is computed once."""
+        core, head = self._parts
+        with core.constant_weights() if isinstance(core, DistinctCore) else nullcontext() as logits:
+            if logits is not None:
+                self._known = TupleCategorical(logits, **head.distribution_kwargs)
+            try:
+                yield
+            finally:
+                self._known = None
+
+    @property
+    def _parts(self) -> Any:
+        """The core and the head."""
+        return self.module
+
+    def _read(self, tensordict: TensorDictBase) -> tuple[TupleCategorical, Evaluated]:
+        core, head = self._parts
+        read = core.read(tensordict)
+        if self._known is not None:
+            return self._known.at(read.nodes), read
+        return TupleCategorical(read.output, rows=read.nodes, **head.distribution_kwargs), read
+
+    def get_dist(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> Any:
+        """The distribution of the actions; see the base class."""
+        if args or kwargs or not isinstance(self._parts[0], DistinctCore):
+            return super().get_dist(tensordict, *args, **kwargs)
+        return self._read(tensordict)[0]
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """Write what the core writes, action and log-probability; see the base class."""
-        modules: Any = self.module
-        core, head = modules
+        core, head = self._parts
         kind = exploration_type() or head.default_interaction_type
         usual = len(args) == 1 and isinstance(args[0], TensorDictBase) and not kwargs
+        usual = usual and isinstance(core, DistinctCore)
         selected = self.out_keys != self.all_out_keys
         if not usual or kind is not ExplorationType.RANDOM or selected:
             return super().forward(*args, **kwargs)
-        tensordict = core(args[0])
-        distribution = TupleCategorical(tensordict.get("logits"), **head.distribution_kwargs)
+        distribution, read = self._read(args[0])
         action, log_prob = distribution.sample_and_log_prob()
+        tensordict = core.write(args[0], *read)
         return tensordict.set("action", action).set("action_log_prob", log_prob)
 
 

@@ -1,0 +1,174 @@
+"""A core that sees the last few inputs, and computes each distinct window once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor, nn
+from torchrl.data import TensorSpec, Unbounded
+
+from torchrl_ecpo.checks import check_count
+from torchrl_ecpo.modules.distinct import DistinctCore, Evaluated, as_readout
+
+__all__ = ["DistinctWindowNetwork"]
+
+STATE_KEY = "window"
+FEW = 1024
+"""So many windows are evaluated one and all."""
+
+
+class DistinctWindowNetwork(DistinctCore):
+    """A feed-forward network over the last inputs that computes each distinct window once.
+
+    A linear layer over the one-hot vectors of the last `window` inputs, then the readout. What a
+    batch of trajectories has in its windows repeats: a window of one has a few dozen values in
+    thousands of steps. It takes the place of :class:`DistinctHistoryLSTM`, in sampling and in
+    recurrent mode (:class:`torchrl.modules.set_recurrent_mode`, whole sequences `[*B, T]`).
+
+    - Places of the window before `is_init` are empty: their part of the layer is 0.
+    - With `window` = 1 (a policy without memory) nothing else is read and no state travels.
+      Otherwise the inputs before the present one travel as one number, int64 `[*B, 1]`. In
+      recurrent mode every sequence begins with a trajectory's first step.
+
+    Args:
+        num_classes: the number of classes of each input, in the order of the input keys and of
+            their last dimensions.
+        hidden_size: H, the width of the linear layer. Default 128.
+        window: how many inputs are seen, the present one among them. Default 1.
+        readout: a module that is applied to each distinct output `[n, H]`, for example a
+            nonlinearity and a linear layer to logits. Default None: the output is the first
+            layer's.
+        in_keys: the integer inputs, each `[*B]` or `[*B, d]`.
+        out_key: the output. Default "embed".
+        device: of the parameters.
+        dtype: of the parameters.
+
+    Attributes:
+        layer: the `torch.nn.Linear` over `window` one-hot vectors, the present one first.
+
+    Raises:
+        KeyError: if `is_init` is missing, or the state of a row that continues (`window` > 1).
+        ValueError: if an input is out of range or cannot be read, or if there are more than 2^62
+            different windows; in recurrent mode for a sequence that begins in the middle of a
+            trajectory.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules import set_recurrent_mode
+        >>> from torchrl_ecpo.modules import DistinctWindowNetwork
+        >>> network = DistinctWindowNetwork([4, 3], 8, 2, in_keys=["observation", "last_action"])
+        >>> data = TensorDict(
+        ...     observation=torch.randint(4, (6, 10)),
+        ...     last_action=torch.randint(3, (6, 10)),
+        ...     is_init=(torch.arange(10) == 0).expand(6, 10).unsqueeze(-1),
+        ...     batch_size=[6, 10],
+        ... )
+        >>> with set_recurrent_mode(True):
+        ...     network(data)["embed"].shape
+        torch.Size([6, 10, 8])
+    """
+
+    def __init__(
+        self,
+        num_classes: Sequence[int],
+        hidden_size: int = 128,
+        window: int = 1,
+        readout: nn.Module | None = None,
+        *,
+        in_keys: Sequence[NestedKey],
+        out_key: str = "embed",
+        device: torch.device | str | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        self.window = check_count("window", window)
+        self.needs_starts = self.window > 1
+        self.state_keys = [STATE_KEY] * self.needs_starts
+        super().__init__(num_classes, in_keys=in_keys, out_key=out_key)
+        self.hidden_size = check_count("hidden_size", hidden_size)
+        # The digits of a window's number are its symbols, 0 for none, the present one last.
+        self.base = self.num_symbols + 1
+        if self.base**self.window > 2**62:
+            raise ValueError(
+                f"window: expected at most 2^62 different windows, got {self.base}^{self.window}."
+            )
+        factory: dict[str, Any] = {"device": device, "dtype": dtype}
+        self.layer = nn.Linear(self.window * sum(self.num_classes), self.hidden_size, **factory)
+        self.readout = as_readout(readout)
+        self._table: Tensor | None = None
+
+    def state_specs(self) -> dict[NestedKey, TensorSpec]:
+        """The window's past as one number, int64 `[1]`."""
+        return {key: Unbounded(torch.Size((1,)), dtype=torch.int64) for key in self.state_keys}
+
+    def evaluate(
+        self,
+        symbols: Tensor,
+        starts: Tensor,
+        mask: Tensor | None = None,
+        states: Sequence[Tensor] | None = None,
+    ) -> Evaluated:
+        """See the base class; padded steps have the empty window."""
+        windows = self.find_windows(symbols, starts, None if states is None else states[0])
+        if mask is not None:
+            windows = windows.masked_fill(~mask, 0)
+        if self.is_tabular:
+            present = torch.arange(self.base**self.window, device=windows.device)
+            nodes, output = windows, self._table
+        else:
+            present, nodes = windows.unique(return_inverse=True)
+            output = None
+        output = self.read_out(present) if output is None else output
+        past = (present % self.base ** (self.window - 1)).unsqueeze(1)
+        handed_on: Any = dict.fromkeys(self.state_keys, past)
+        return Evaluated(nodes, output, handed_on)
+
+    @property
+    def is_tabular(self) -> bool:
+        """Whether all windows are evaluated, which costs less than to find those that occur."""
+        return self.base**self.window <= FEW
+
+    @contextmanager
+    def constant_weights(self) -> Iterator[Tensor | None]:
+        """Within, the weights do not change: yields the output of all windows if it is kept."""
+        every = torch.arange(self.base**self.window * self.is_tabular)
+        self._table = self.read_out(every.to(self.layer.weight.device)) if len(every) else None
+        try:
+            yield self._table
+        finally:
+            self._table = None
+
+    def find_windows(self, symbols: Tensor, starts: Tensor, past: Tensor | None) -> Tensor:
+        """The window at each step as a number, int64 `[T, N]`.
+
+        Of a single step it continues the past `[N, 1]`.
+        """
+        digits = symbols + 1
+        first = torch.zeros_like(digits[:1]) if past is None else past.t()
+        windows = digits
+        for _ in range(min(self.window - 1, len(symbols))):
+            before = torch.cat([first, windows[:-1]]).masked_fill(starts, 0)
+            windows = digits + self.base * before
+        return windows
+
+    def read_out(self, windows: Tensor) -> Tensor:
+        """The output of each window `[n]`."""
+        return self.readout(self.project_by(self.layer.weight, self.layer.bias, windows))
+
+    def hot(self, symbols: Tensor) -> Tensor:
+        """Where the one-hot vectors of windows `[n]` are 1, `[n, window * d]`.
+
+        Those of empty places are at the row after the last.
+        """
+        num_columns = sum(self.num_classes)
+        parts = []
+        for lag in range(self.window):
+            digit = symbols // self.base**lag % self.base
+            columns = super().hot(digit - 1) + lag * num_columns
+            is_empty = (digit == 0).unsqueeze(-1)
+            parts.append(columns.masked_fill(is_empty, self.window * num_columns))
+        return torch.cat(parts, -1)
