@@ -14,12 +14,14 @@ from stacked import check_runs, runs_of, train_stack
 from tasks import make_task
 from torch.nn.utils import clip_grad_norm_
 from utils import (
+    is_far,
     is_single,
     make_collector,
     make_loss,
     make_optimizer,
     make_run,
     make_temperatures,
+    of_batch,
     reached,
     total_loss,
 )
@@ -67,19 +69,24 @@ def main(config: DictConfig) -> None:
             collector.update_policy_weights_()
             lifted_at = progress.trajectories
             for _ in range(config.project_steps):
-                # Project: one gradient step on fresh trajectories of the reference.
+                # Project: gradient steps on fresh trajectories of the reference.
                 groups = next(groups_of_trajectories)
-                losses = loss_module(groups)
-                optimizer.zero_grad()
-                total_loss(losses, loss_module).backward()
-                grad_norm = clip_grad_norm_(loss_module.parameters(), max_grad_norm)
-                metrics = {**losses.detach(), "grad_norm": grad_norm}
-                run.check(metrics, progress.trajectories)
-                optimizer.step()
+                of_steps: list[Metrics] = []
+                for _ in range(config.epochs):
+                    losses = loss_module(groups)
+                    of_steps.append(losses.detach().to_dict())
+                    if is_far(of_steps, config.max_kl):
+                        break
+                    optimizer.zero_grad()
+                    total_loss(losses, loss_module).backward()
+                    grad_norm = clip_grad_norm_(loss_module.parameters(), max_grad_norm)
+                    of_steps[-1]["grad_norm"] = grad_norm
+                    run.check(of_steps[-1], progress.trajectories)
+                    optimizer.step()
 
                 progress.trajectories += config.num_groups * config.group_size
                 progress.project_steps += 1
-                metrics |= {**task.measure(groups), **temperatures.values()}
+                metrics = of_batch(of_steps) | task.measure(groups) | temperatures.values()
                 if progress.project_steps % config.evaluation_interval == 0:
                     metrics |= task.evaluate(groups)
                 run.log(metrics, step=progress.trajectories)

@@ -39,10 +39,12 @@ from torchrl.modules import (
     get_env_transforms_from_module,
 )
 
+from torchrl_ecpo.collectors import TrajectoryGroupCollector
 from torchrl_ecpo.envs import AlgorithmicEnv, BanditEnv, EpisodeReplay, GroupedEnv
 from torchrl_ecpo.modules import SharedCategorical, make_softmax_policy, make_tuple_policy
 
 EVALUATION_EPISODES = 100
+LONG_LEVEL = 30  # the last one
 Metrics = dict[str, float | Tensor]
 
 
@@ -61,7 +63,7 @@ class Task:
     """Measures the actor as it stands, or what takes long to measure of the last batch."""
     shown: Sequence[str]
     """Metrics on the progress bar and in the picture."""
-    evaluation_env: EnvBase | None = None
+    evaluation_env: nn.Module | None = None
     """Its state goes into checkpoints."""
 
 
@@ -96,7 +98,7 @@ def make_bandit(config: DictConfig) -> Task:
 
 
 def make_algorithmic(config: DictConfig) -> Task:
-    """A task of gym's algorithmic suite, with the recurrent tuple policy."""
+    """A task of gym's algorithmic suite, with the policy that ``policy=`` names."""
     make_env = partial(
         AlgorithmicEnv,
         config.env.name,
@@ -108,31 +110,69 @@ def make_algorithmic(config: DictConfig) -> Task:
     actor = make_tuple_policy(
         num_observations=env.task.base + 1,
         nvec=action_spec.nvec[0, 0].tolist(),
-        hidden_size=config.env.hidden_size,
-        distinct_histories=config.env.distinct_histories,
+        hidden_size=config.policy.hidden_size,
+        window=config.policy.window,
     )
-    other = AlgorithmicEnv(config.env.name, num_groups=EVALUATION_EPISODES, curriculum=None)
-    evaluation_env = TransformedEnv(other, get_env_transforms_from_module(actor))
-    other.set_seed(config.seed + 1_000_000)
+    evaluation = Evaluation(config.env.name, actor, config.seed + 1_000_000)
 
     def measure(groups: TensorDictBase) -> Metrics:
         return {
             "level": groups["level"][..., 0].float().mean(),
-            "attained": _returns(groups).sum() / groups["attainable"][..., 0].sum(),
+            "attained": attained(groups),
             "length": groups["collector", "mask"].sum(-1).float().mean(),
         }
 
     def evaluate(groups: TensorDictBase) -> Metrics:
-        other.curriculum.levels.fill_(round(groups["level"][..., 0].float().mean().item()))
-        episodes = _greedy(evaluation_env, actor)
-        return {
-            "greedy_return": _returns(episodes).mean(),
-            "greedy_attained": _returns(episodes).sum() / episodes["attainable"][..., 0].sum(),
-            "distinct_solutions": distinct_solutions(groups),
-        }
+        return evaluation.measure(round(groups["level"][..., 0].float().mean().item()))
 
     shown = ("return", "level", "attained", "entropy", "ESS")
-    return Task(env, make_env, actor, measure, evaluate, shown, other)
+    return Task(env, make_env, actor, measure, evaluate, shown, evaluation)
+
+
+class Evaluation(nn.Module):
+    """Plays an algorithmic task beside the training: greedily, and in groups of ten.
+
+    Its state is that of its environments.
+    """
+
+    def __init__(self, name: str, actor: ProbabilisticTensorDictSequential, seed: int) -> None:
+        super().__init__()
+        half, ten = EVALUATION_EPISODES, 10
+        # A level for each row, which `_set_level` sets.
+        self.greedy = AlgorithmicEnv(name, num_groups=2 * half, curriculum="group")
+        self.groups = AlgorithmicEnv(name, num_groups=half // ten, group_size=ten, curriculum=None)
+        self._env = [TransformedEnv(self.greedy, get_env_transforms_from_module(actor))]
+        self._actor = [actor]  # whose parameters are not the evaluation's
+        self._collector = [
+            TrajectoryGroupCollector(self.groups, actor, num_groups=half // ten, group_size=ten)
+        ]
+        for env in (self.greedy, self.groups):
+            env.set_seed(seed)
+
+    def measure(self, level: int) -> Metrics:
+        """What the policy as it stands is worth at a level of the curriculum.
+
+        ``long_attained`` is that of greedy play at the highest level, which tells early whether a
+        policy reads the tape or writes from memory.
+        """
+        for env in (self.greedy, self.groups):
+            env.curriculum.levels.fill_(level)
+            env.curriculum.streaks.zero_()
+        self.greedy.curriculum.levels[EVALUATION_EPISODES:] = LONG_LEVEL
+        played = _greedy(self._env[0], self._actor[0])
+        episodes, long = played[:EVALUATION_EPISODES], played[EVALUATION_EPISODES:]
+        collector = self._collector[0]
+        collector.update_policy_weights_()
+        groups = collector.rollout()
+        solved = is_solved(groups)
+        return {
+            "greedy_return": _returns(episodes).mean(),
+            "greedy_attained": attained(episodes),
+            "long_attained": attained(long),
+            "pass_at_1": solved.float().mean(),
+            "pass_at_10": solved.any(1).float().mean(),
+            "distinct_solutions": distinct_solutions(groups),
+        }
 
 
 def make_gym(config: DictConfig) -> Task:
@@ -212,7 +252,7 @@ def distinct_solutions(groups: TensorDictBase) -> float:
     makes no difference.
     """
     group_size = groups.shape[1]
-    solved = (_returns(groups) >= groups["attainable"][..., 0]).flatten()
+    solved = is_solved(groups).flatten()
     action = groups["action"].flatten(0, 1)[solved]
     is_written = torch.ones_like(action, dtype=torch.bool)
     is_written[..., 2] = action[..., 1] == 1
@@ -220,6 +260,16 @@ def distinct_solutions(groups: TensorDictBase) -> float:
     ways = action.where(is_real & is_written, -1).flatten(1)
     group = solved.nonzero() // group_size
     return len(torch.cat([group, ways], 1).unique(dim=0)) / len(groups)
+
+
+def is_solved(episodes: TensorDictBase) -> Tensor:
+    """Whether each episode earned all that it could."""
+    return _returns(episodes) >= episodes["attainable"][..., 0]
+
+
+def attained(episodes: TensorDictBase) -> Tensor:
+    """What share of all that could be earned was."""
+    return _returns(episodes).sum() / episodes["attainable"][..., 0].sum()
 
 
 def _returns(episodes: TensorDictBase) -> Tensor:

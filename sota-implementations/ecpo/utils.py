@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -120,6 +120,21 @@ def make_temperatures(config: DictConfig, loss_module: TrajectoryGroupLoss) -> T
     assert isinstance(settings, dict)
     schedules = {name: make_schedule(settings[name]) for name in TEMPERATURES if name in settings}
     return TemperatureScheduler(loss_module, **schedules)
+
+
+def is_far(of_steps: Sequence[Metrics], max_kl: float | None) -> bool:
+    """Whether the gradient steps on a batch have led further from the reference than they may."""
+    has_stepped = len(of_steps) > 1 and max_kl is not None
+    return has_stepped and bool(of_steps[-1]["kl_reference_policy"] > max_kl)
+
+
+def of_batch(of_steps: Sequence[Metrics]) -> Metrics:
+    """The metrics of a batch, from those that the loss gave before each gradient step on it.
+
+    They are those of the policy before the first one, and how far the last one found it.
+    """
+    last = {"kl_reference_policy": of_steps[-1]["kl_reference_policy"]}
+    return {**of_steps[0], **last, "gradient_steps": sum("grad_norm" in step for step in of_steps)}
 
 
 def reached(goal: DictConfig | None, metrics: Metrics) -> bool:

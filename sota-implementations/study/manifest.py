@@ -33,10 +33,17 @@ NOT_THE_RUN = (
     *("env.settings", "env.optim", "env.cracked", "env.num_groups", "env.evaluation_interval"),
     "loss.options.deactivate_vmap",
 )
-# Entries that the scripts no longer have, with the one value that is left: older runs have them.
+# Entries that older runs have or lack, with the value that is or was the only one.
 GONE = {
     "env.head": "masked",  # the action's parts; independent factors and one softmax had no result
     "loss.length_normalised": False,  # of the entropy term of a lift; true had no result
+    "env.distinct_histories": True,  # as TorchRL's LSTMModule has it; the same numbers, slower
+    "env.hidden_size": 128,  # of the LSTM, which was the only policy
+    "policy.name": "lstm",
+    "policy.window": "None",
+    "policy.hidden_size": 128,
+    "epochs": 1,
+    "max_kl": "None",
 }
 
 Entry = TypeVar("Entry")

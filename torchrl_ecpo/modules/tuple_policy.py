@@ -348,7 +348,38 @@ def make_tuple_policy(
     )
 
 
-class _TupleActor(ProbabilisticActor):
+class TuplePolicy:
+    """What policies over a :class:`DistinctCore` share: distributions of each distinct past."""
+
+    _known: TupleCategorical | None = None
+
+    @property
+    def parts(self) -> tuple[Any, dict[str, Any]]:
+        """The core, and what the distribution takes beside the logits."""
+        raise NotImplementedError
+
+    @contextmanager
+    def constant_weights(self) -> Iterator[None]:
+        """Within, the weights do not change: what depends on them alone is computed once."""
+        core, options = self.parts
+        with core.constant_weights() if isinstance(core, DistinctCore) else nullcontext() as logits:
+            if logits is not None:
+                self._known = TupleCategorical(logits, **options)
+            try:
+                yield
+            finally:
+                self._known = None
+
+    def read(self, tensordict: TensorDictBase) -> tuple[TupleCategorical, Evaluated]:
+        """The distribution of the actions, and what the core makes of the batch."""
+        core, options = self.parts
+        read = core.read(tensordict)
+        if self._known is not None:
+            return self._known.at(read.nodes), read
+        return TupleCategorical(read.output, rows=read.nodes, **options), read
+
+
+class _TupleActor(TuplePolicy, ProbabilisticActor):
     """Evaluates distribution and sample once for each distinct past.
 
     Whatever else is asked of it goes the way of its base class, which costs as much as the LSTM
@@ -358,48 +389,30 @@ class _TupleActor(ProbabilisticActor):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.all_out_keys = list(self.out_keys)
-        self._known: TupleCategorical | None = None
-
-    @contextmanager
-    def constant_weights(self) -> Iterator[None]:
-        """Within, the weights do not change: what depends on them alone is computed once."""
-        core, head = self._parts
-        with core.constant_weights() if isinstance(core, DistinctCore) else nullcontext() as logits:
-            if logits is not None:
-                self._known = TupleCategorical(logits, **head.distribution_kwargs)
-            try:
-                yield
-            finally:
-                self._known = None
 
     @property
-    def _parts(self) -> Any:
-        """The core and the head."""
-        return self.module
-
-    def _read(self, tensordict: TensorDictBase) -> tuple[TupleCategorical, Evaluated]:
-        core, head = self._parts
-        read = core.read(tensordict)
-        if self._known is not None:
-            return self._known.at(read.nodes), read
-        return TupleCategorical(read.output, rows=read.nodes, **head.distribution_kwargs), read
+    def parts(self) -> tuple[Any, dict[str, Any]]:
+        modules: Any = self.module
+        core, head = modules
+        return core, head.distribution_kwargs
 
     def get_dist(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> Any:
         """The distribution of the actions; see the base class."""
-        if args or kwargs or not isinstance(self._parts[0], DistinctCore):
+        if args or kwargs or not isinstance(self.parts[0], DistinctCore):
             return super().get_dist(tensordict, *args, **kwargs)
-        return self._read(tensordict)[0]
+        return self.read(tensordict)[0]
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """Write what the core writes, action and log-probability; see the base class."""
-        core, head = self._parts
+        modules: Any = self.module
+        core, head = modules
         kind = exploration_type() or head.default_interaction_type
         usual = len(args) == 1 and isinstance(args[0], TensorDictBase) and not kwargs
         usual = usual and isinstance(core, DistinctCore)
         selected = self.out_keys != self.all_out_keys
         if not usual or kind is not ExplorationType.RANDOM or selected:
             return super().forward(*args, **kwargs)
-        distribution, read = self._read(args[0])
+        distribution, read = self.read(args[0])
         action, log_prob = distribution.sample_and_log_prob()
         tensordict = core.write(args[0], *read)
         return tensordict.set("action", action).set("action_log_prob", log_prob)

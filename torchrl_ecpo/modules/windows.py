@@ -92,7 +92,8 @@ class DistinctWindowNetwork(DistinctCore):
         self.hidden_size = check_count("hidden_size", hidden_size)
         # The digits of a window's number are its symbols, 0 for none, the present one last.
         self.base = self.num_symbols + 1
-        if self.base**self.window > 2**62:
+        self.num_windows = self.base**self.window
+        if self.num_windows > 2**62:
             raise ValueError(
                 f"window: expected at most 2^62 different windows, got {self.base}^{self.window}."
             )
@@ -117,7 +118,7 @@ class DistinctWindowNetwork(DistinctCore):
         if mask is not None:
             windows = windows.masked_fill(~mask, 0)
         if self.is_tabular:
-            present = torch.arange(self.base**self.window, device=windows.device)
+            present = torch.arange(self.num_windows, device=windows.device)
             nodes, output = windows, self._table
         else:
             present, nodes = windows.unique(return_inverse=True)
@@ -135,8 +136,9 @@ class DistinctWindowNetwork(DistinctCore):
     @contextmanager
     def constant_weights(self) -> Iterator[Tensor | None]:
         """Within, the weights do not change: yields the output of all windows if it is kept."""
-        every = torch.arange(self.base**self.window * self.is_tabular)
-        self._table = self.read_out(every.to(self.layer.weight.device)) if len(every) else None
+        if self.is_tabular:
+            device = next(self.parameters()).device
+            self._table = self.read_out(torch.arange(self.num_windows, device=device))
         try:
             yield self._table
         finally:

@@ -16,8 +16,8 @@ from torchrl_ecpo.experiment.run import flatten
 FOLDER = Path(__file__).parents[1]
 KINDS = ("algorithmic", "bandit")
 MAY_DIFFER = (
-    *("seed", "loss", "optim", "project_steps", "anneal_from", "evaluation_interval"),
-    *("env.curriculum", "env.instance_seed"),
+    *("seed", "loss", "optim", "project_steps", "epochs", "max_kl"),
+    *("anneal_from", "evaluation_interval", "env.curriculum", "env.instance_seed"),
 )
 
 
@@ -93,8 +93,6 @@ def _check_together(runs: Sequence[DictConfig]) -> None:
             f"Tasks of the kinds {KINDS} can be stacked, got env.kind={first.env.kind!r}. Start "
             "processes instead: --multirun seed=0,1"
         )
-    if not first.env.get("distinct_histories", True):
-        raise ValueError("Stacked runs need env.distinct_histories=true.")
     flat = [flatten(OmegaConf.to_container(run, resolve=True)) for run in runs]
     for name in dict.fromkeys(["env.name", *(name for own in flat for name in own)]):
         values = list(dict.fromkeys(str(own.get(name, "absent")) for own in flat))

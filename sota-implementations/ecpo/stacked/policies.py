@@ -19,8 +19,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
-from torchrl_ecpo.modules import DistinctHistoryLSTM, TupleCategorical
+from torchrl_ecpo.modules import DistinctHistoryLSTM, DistinctWindowNetwork
+from torchrl_ecpo.modules.distinct import take_rows
 from torchrl_ecpo.modules.histories import Histories, distinct_histories, hash_histories
+from torchrl_ecpo.modules.tuple_policy import TuplePolicy
 
 BITS_OF_RUN = 10  # of the hash of a history: two collide with probability 2^-54
 
@@ -33,8 +35,7 @@ def stack_policies(actors: Sequence[Any], random_states: Sequence[Tensor]) -> St
         random_states: of the random generator that each run samples with, as
             `torch.get_rng_state` gives them.
     """
-    is_recurrent = isinstance(actors[0].module[0], DistinctHistoryLSTM)
-    kind = _StackedTuplePolicy if is_recurrent else _SeparatePolicies
+    kind = _StackedTuplePolicy if isinstance(actors[0], TuplePolicy) else _SeparatePolicies
     return kind(actors, RandomStreams(random_states))
 
 
@@ -83,11 +84,11 @@ class RandomStreams(nn.Module):
             generator.set_state(own.clone())  # torch reads a view from its storage's beginning
 
     def uniform(self, sizes: Sequence[int], like: Tensor) -> Tensor:
-        """Numbers in [0, 1) for logits ``[sum(sizes), width]``: `sizes` rows of each run."""
+        """Numbers in [0, 1), three for each row of logits ``[*B, L]``: `sizes` rows of each run."""
         dtype = torch.promote_types(like.dtype, torch.float32)  # as TupleCategorical.sample
         parts = zip(sizes, self.generators, strict=True)
-        draws = [torch.rand(n, like.shape[-1], generator=own, dtype=dtype) for n, own in parts]
-        return torch.cat(draws).view_as(like)
+        draws = [torch.rand(n, 3, generator=own, dtype=dtype) for n, own in parts]
+        return torch.cat(draws).view(*like.shape[:-1], 3)
 
     @contextmanager
     def drawing_from(self, run: int) -> Iterator[None]:
@@ -130,35 +131,38 @@ class _SeparatePolicies(StackedPolicy):
         return tensordict
 
 
-class _StackedTuplePolicy(StackedPolicy):
-    """The recurrent tuple policy of each run, evaluated together."""
+class _StackedTuplePolicy(TuplePolicy, StackedPolicy):
+    """The tuple policy of each run, evaluated together."""
 
     def __init__(self, actors: Sequence[Any], streams: RandomStreams) -> None:
         super().__init__()
-        self.core = _StackedHistoryLSTM([actor.module[0] for actor in actors])
-        self.options = actors[0].module[1].distribution_kwargs
+        cores = [actor.parts[0] for actor in actors]
+        is_recurrent = isinstance(cores[0], DistinctHistoryLSTM)
+        self.core = (_StackedHistoryLSTM if is_recurrent else _StackedWindowNetwork)(cores)
+        self.options = actors[0].parts[1]
         in_keys: list[Any] = self.core.in_keys
         out_keys: list[Any] = [*self.core.out_keys, "action", "action_log_prob"]
         self.in_keys, self.out_keys = in_keys, out_keys
         self.streams = streams
 
     @property
+    def parts(self) -> tuple[Any, dict[str, Any]]:
+        return self.core, self.options
+
+    @property
     def runs(self) -> nn.ModuleList:
         return self.core.cells
 
-    def get_dist(self, tensordict: TensorDictBase) -> TupleCategorical:
-        """The distribution of all rows; writes logits and states."""
-        return TupleCategorical(self.core(tensordict).get("logits"), **self.options)
-
     def log_prob(self, steps: TensorDictBase) -> Tensor:
         with set_recurrent_mode(True):
-            return self.get_dist(steps).log_prob(steps["action"])
+            return self.read(steps)[0].log_prob(steps["action"])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write logits, states, action and log-probability."""
-        distribution = self.get_dist(tensordict)
+        distribution, read = self.read(tensordict)
+        self.core.write(tensordict, *read)
         sizes = self._count_rows(tensordict)
-        action = distribution.choose(self.streams.uniform(sizes, distribution.logits))
+        action = distribution.choose(self.streams.uniform(sizes, tensordict["logits"]))
         tensordict.set("action", action)
         return tensordict.set("action_log_prob", distribution.log_prob(action))
 
@@ -201,9 +205,12 @@ class _StackedHistoryLSTM(DistinctHistoryLSTM):
 
     def project(self, symbols: Tensor) -> Tensor:
         run, own = symbols // self.num_symbols, symbols % self.num_symbols
-        parts = own.split(self._count(run))
+        parts = own.split(_count(run, self.cells))
         return torch.cat(
-            [self.project_by(cell, part) for (cell, _), part in zip(self.cells, parts, strict=True)]
+            [
+                self.project_by_cell(cell, part)
+                for (cell, _), part in zip(self.cells, parts, strict=True)
+            ]
         )
 
     @property
@@ -213,10 +220,50 @@ class _StackedHistoryLSTM(DistinctHistoryLSTM):
     def read_out(self, h: Tensor, symbols: Tensor) -> Tensor:
         run = symbols // self.num_symbols
         order = run.argsort(stable=True)
-        parts = h.index_select(0, order).split(self._count(run))
+        parts = take_rows(h, order).split(_count(run, self.cells))
         outputs = [readout(own) for (_, readout), own in zip(self.cells, parts, strict=True)]
-        return torch.cat(outputs).index_select(0, order.argsort())
+        return take_rows(torch.cat(outputs), order.argsort())
 
-    def _count(self, runs: Tensor) -> list[int]:
-        """How many of each run there are."""
-        return runs.bincount(minlength=len(self.cells)).tolist()
+
+class _StackedWindowNetwork(DistinctWindowNetwork):
+    """The window network of each run. A window says which run it belongs to."""
+
+    cells: Any
+    """Layer and readout of each run."""
+
+    def __init__(self, cores: Sequence[DistinctWindowNetwork]) -> None:
+        first = cores[0]
+        super().__init__(
+            first.num_classes,
+            first.hidden_size,
+            first.window,
+            in_keys=first.input_keys,
+            out_key=str(first.out_keys[0]),
+        )
+        del self.layer, self.readout
+        in_keys: list[Any] = [*self.in_keys, "run"]
+        self.in_keys = in_keys
+        self.cells = nn.ModuleList(nn.ModuleList([core.layer, core.readout]) for core in cores)
+        self.num_windows *= len(cores)
+
+    def read_symbols(self, tensordict: TensorDictBase) -> Tensor:
+        return super().read_symbols(tensordict) + self.num_symbols * tensordict.get("run")
+
+    def find_windows(self, symbols: Tensor, starts: Tensor, past: Tensor | None) -> Tensor:
+        run, own = symbols // self.num_symbols, symbols % self.num_symbols
+        return super().find_windows(own, starts, past) + run * self.base**self.window
+
+    def read_out(self, windows: Tensor) -> Tensor:
+        run, own = windows // self.base**self.window, windows % self.base**self.window
+        parts = own.split(_count(run, self.cells))
+        return torch.cat(
+            [
+                readout(self.project_by(layer.weight, layer.bias, part))
+                for (layer, readout), part in zip(self.cells, parts, strict=True)
+            ]
+        )
+
+
+def _count(runs: Tensor, cells: Sequence[Any]) -> list[int]:
+    """How many of each run there are."""
+    return runs.bincount(minlength=len(cells)).tolist()

@@ -16,7 +16,16 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
-from utils import make_loss, make_optimizer, make_run, make_temperatures, reached, total_loss
+from utils import (
+    is_far,
+    make_loss,
+    make_optimizer,
+    make_run,
+    make_temperatures,
+    of_batch,
+    reached,
+    total_loss,
+)
 
 from stacked.envs import stack_envs
 from stacked.policies import stack_policies
@@ -118,28 +127,38 @@ class Stack:
             self.collector.update_policy_weights_()
 
     def project(self) -> None:
-        """One gradient step of each run, on fresh trajectories of its reference."""
+        """Gradient steps of each run, on fresh trajectories of its reference."""
         groups = next(self._batches)
-        all_losses = self._losses(groups)
-        for member in self.members:
-            member.optimizer.zero_grad()
-        runs = zip(all_losses, self.members, strict=True)
-        torch.stack([total_loss(each, run.loss_module) for each, run in runs]).sum().backward()
-        for member, losses in zip(self.members, all_losses, strict=True):
-            max_norm = member.config.optim.max_grad_norm or float("inf")
-            grad_norm = clip_grad_norm_(member.optimizer.param_groups[0]["params"], max_norm)
-            member.metrics = {**losses.detach(), "grad_norm": grad_norm}
-            self._check(member)
-        for member in self.members:
-            member.optimizer.step()
+        of_steps: list[list[Metrics]] = [[] for _ in self.members]
+        stepping = list(range(len(self.members)))
+        for epoch in range(max(member.config.epochs for member in self.members)):
+            all_losses = self._losses(groups)
+            for index in list(stepping):
+                config = self.members[index].config
+                if epoch < config.epochs:
+                    of_steps[index].append(all_losses[index].detach().to_dict())
+                if epoch >= config.epochs or is_far(of_steps[index], config.max_kl):
+                    stepping.remove(index)
+            if not stepping:
+                break
+            losses = [total_loss(all_losses[i], self.members[i].loss_module) for i in stepping]
+            for index in stepping:
+                self.members[index].optimizer.zero_grad()
+            torch.stack(losses).sum().backward()
+            for index in stepping:
+                self._step(self.members[index], of_steps[index][-1])
 
         self.progress.trajectories += self._batch_size
         self.progress.project_steps += 1
-        for member, part in zip(self.members, self._split(groups), strict=True):
-            member.metrics |= {**member.task.measure(part), **member.temperatures.values()}
+        for index, part in enumerate(self._split(groups)):
+            member = self.members[index]
+            metrics = of_batch(of_steps[index]) | member.task.measure(part)
+            metrics |= member.temperatures.values()
             if self.progress.project_steps % member.config.evaluation_interval == 0:
-                member.metrics |= member.task.evaluate(part)
-            member.run.log(member.metrics, step=self.progress.trajectories)
+                with self.collector.policy.streams.drawing_from(index):
+                    metrics |= member.task.evaluate(part)
+            member.metrics = metrics
+            member.run.log(metrics, step=self.progress.trajectories)
 
     def anneal(self) -> None:
         """Where a run's projection ends, its temperatures may fall."""
@@ -165,12 +184,16 @@ class Stack:
         parts: Any = groups.chunk(len(self.members))
         return [part[..., : int(part[MASK_KEY].sum(-1).max())] for part in parts]
 
-    def _check(self, member: Member) -> None:
-        """Stop all runs before one is spoilt."""
+    def _step(self, member: Member, metrics: Metrics) -> None:
+        """A gradient step of a run; all stop before one is spoilt."""
+        max_norm = member.config.optim.max_grad_norm or float("inf")
+        parameters = member.optimizer.param_groups[0]["params"]
+        metrics["grad_norm"] = clip_grad_norm_(parameters, max_norm)
         try:
-            member.run.check(member.metrics, self.progress.trajectories)
+            member.run.check(metrics, self.progress.trajectories)
         except FloatingPointError as error:
             raise FloatingPointError(f"{member.run.name}: {error}") from error
+        member.optimizer.step()
 
 
 def _make_member(directory: Path, config: DictConfig, task: Task, **options: Any) -> Member:
