@@ -1070,11 +1070,11 @@ def standardised_in_batch(
         :func:`standardised`. These count in the deviation.
 
     Examples:
-        The distances are 1, 1, 3 and 3, the deviation is the root of 5:
+        The distances are 1, 1, 7 and 7, the deviation is 5:
 
-        >>> standardised_in_batch(torch.tensor([[0.0, 2.0], [0.0, 6.0]])) * math.sqrt(5)
-        tensor([[-1.,  1.],
-                [-3.,  3.]])
+        >>> standardised_in_batch(torch.tensor([[0.0, 2.0], [0.0, 14.0]]))
+        tensor([[-0.2000,  0.2000],
+                [-1.4000,  1.4000]])
     """
     distance = _spread(score, sample_dim=sample_dim, mask=mask)
     real = None if mask is None else mask.expand_as(distance).flatten()
