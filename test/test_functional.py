@@ -38,6 +38,7 @@ from torchrl_ecpo.functional import (
     soft_value_estimate,
     squared_residual_projection,
     standardised,
+    standardised_in_batch,
     surrogate_reward,
     surrogate_reward_estimate,
     temperature_dual,
@@ -809,8 +810,9 @@ def test_masked_algebra_by_hand(name, dtype):
 
 
 @DTYPES
+@pytest.mark.parametrize("standardised", [standardised, standardised_in_batch])
 @pytest.mark.parametrize("constant", [0.0, 0.1, -3.0, 1e4, 1e30])
-def test_standardised_scores_of_equal_samples_are_zero(dtype, constant):
+def test_standardised_scores_of_equal_samples_are_zero(dtype, standardised, constant):
     """Equal up to rounding is equal: their spread is noise, and would be blown up to 1."""
     score = torch.full((3, 7), constant, dtype=dtype)
     assert (standardised(score) == 0).all()
@@ -822,16 +824,59 @@ def test_standardised_scores_of_equal_samples_are_zero(dtype, constant):
 
 @PROPERTY
 @given(x=groups(k=5), scale=st.sampled_from([1e-30, 1e-3, 1.0, 1e30]), shift=st.floats(-9, 9))
-def test_standardised_scores_have_mean_zero_and_deviation_one(x, scale, shift):
+@pytest.mark.parametrize("standardised", [standardised, standardised_in_batch])
+def test_standardised_scores_have_mean_zero_and_deviation_one(standardised, x, scale, shift):
     score = x.score + torch.arange(5.0)
     actual = standardised(scale * (score + shift))
     assert_close(actual, (score - score.mean()) / score.std(correction=0), atol=1e-6, rtol=1e-6)
+
+
+@DTYPES
+@pytest.mark.parametrize("junk", [7.0, math.nan, math.inf, -math.inf])
+def test_scores_in_the_deviation_of_the_batch_by_hand(dtype, junk):
+    """Distances 1, 1; 2, 2, 4; 0, 0, 0 from the means 1, 3, 0.1; mean square 26 / 8."""
+    rows = [[0, 2, junk], [1, 1, 7], [0.1, 0.1, 0.1], [junk, junk, junk]]
+    score = torch.tensor(rows, dtype=dtype)
+    score[2, 1] += torch.finfo(dtype).eps / 8  # equal up to rounding
+    mask = torch.tensor([[True, True, False], [True] * 3, [True] * 3, [False] * 3])
+    rows = [[-1, 1, 0], [-2, -2, 4], [0, 0, 0], [0, 0, 0]]
+    expected = torch.tensor(rows, dtype=dtype) / math.sqrt(26 / 8)
+    actual = standardised_in_batch(score, mask=mask)
+    assert_close(actual, expected)
+    assert (actual[2:] == 0).all()
+    assert_close(standardised_in_batch(score.mT, sample_dim=0, mask=mask.mT), expected.mT)
+    shape = (2, 2, 3)
+    actual = standardised_in_batch(score.view(shape), mask=mask.view(shape))
+    assert_close(actual, expected.view(shape))
+
+
+@PROPERTY
+@given(x=groups(k=12), scale=st.sampled_from([1e-30, 1e-3, 1.0, 1e30]), data=st.data())
+def test_scores_in_the_deviation_of_the_batch(x, scale, data):
+    """Neither a unit nor a shift of each group matters; the order of groups and samples is kept."""
+    score = (x.score + torch.arange(12.0)).view(3, 4)
+    mask = torch.tensor([[True] * 4, [True, False, True, True], [True, True, False, False]])
+    actual = standardised_in_batch(score, mask=mask)
+    assert_close(actual.square().sum(), torch.tensor(9.0, dtype=torch.float64))
+    assert_close(actual.sum(-1), torch.zeros(3, dtype=torch.float64))
+    shift = torch.tensor(data.draw(st.lists(st.floats(-9, 9), min_size=3, max_size=3))).double()
+    moved = standardised_in_batch(scale * (score + shift[:, None]), mask=mask)
+    assert_close(moved, actual, atol=1e-6, rtol=1e-6)
+    rows, columns = (torch.tensor(data.draw(st.permutations(range(n)))) for n in (3, 4))
+    where = (rows[:, None], columns)
+    assert_close(standardised_in_batch(score[where], mask=mask[where]), actual[where])
+    # A group of equal scores adds its number of samples.
+    more = torch.cat([score, torch.full((1, 4), 0.1, dtype=torch.float64)])
+    mask = torch.cat([mask, torch.tensor([[True, True, True, False]])])
+    more = standardised_in_batch(more, mask=mask)
+    assert_close(more, torch.cat([actual, torch.zeros(1, 4)]) * math.sqrt(12 / 9))
 
 
 def test_scores_are_held_constant_and_the_log_probability_is_not():
     score, log_prob = random_samples(2, 4).score.requires_grad_(), random_samples(2, 4).log_prob
     assert not centred(score).requires_grad
     assert not standardised(score).requires_grad
+    assert not standardised_in_batch(score).requires_grad
     assert not score_function_loss(log_prob, score).requires_grad
     expected = -score.detach() / 4
     assert_close(gradient(lambda x: score_function_loss(x, score), log_prob), expected)

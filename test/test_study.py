@@ -143,10 +143,12 @@ def test_the_study_is_what_was_planned(study):
         assert number >= methods[task, "ECPO"], f"{method} has fewer settings than ECPO on {task}"
 
 
-def test_an_option_that_is_gone_makes_no_other_run_unless_it_had_another_value(study):
+def test_an_option_that_is_gone_or_new_makes_no_other_run_unless_it_has_another_value(study):
     changed = study.manifest.changed_entries
     assert changed({"env.head": "masked", "tau": 1}, {"tau": 1}) == []
     assert changed({"env.head": "joint"}, {}) == ["env.head was joint, is masked"]
+    assert changed({"tau": 1}, {"loss.score": "return", "tau": 1}) == []
+    assert changed({}, {"loss.score": "batch"}) == ["loss.score was return, is batch"]
 
 
 @pytest.mark.slow

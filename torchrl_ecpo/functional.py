@@ -76,6 +76,7 @@ __all__ = [
     "soft_value_estimate",
     "squared_residual_projection",
     "standardised",
+    "standardised_in_batch",
     "surrogate_reward",
     "surrogate_reward_estimate",
     "temperature_dual",
@@ -1050,17 +1051,34 @@ def standardised(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = N
                 [ 0.,  0.]])
     """
     where: _Where = {"sample_dim": sample_dim, "mask": mask}
-    distance = centred(score, **where)
-    real = torch.ones_like(distance, dtype=torch.bool) if mask is None else mask
-    highest = score.detach().where(real, -math.inf).amax(sample_dim, keepdim=True)
-    lowest = score.detach().where(real, math.inf).amin(sample_dim, keepdim=True)
-    rounding = 8 * torch.finfo(distance.dtype).eps * torch.maximum(highest.abs(), lowest.abs())
-    is_spread = highest - lowest > rounding
-    # Scaled by the largest distance, so that no square under- or overflows.
-    largest = distance.abs().amax(sample_dim, keepdim=True).where(is_spread, 1.0)
-    unit = distance / largest
-    variance = masked_mean(unit.square(), **where, keepdim=True).where(is_spread, 1.0)
-    return (unit / variance.sqrt()).where(is_spread, 0.0)
+    return _in_deviations(_spread(score, **where), **where)
+
+
+def standardised_in_batch(
+    score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None
+) -> Tensor:
+    r"""Centred scores in units of the standard deviation within groups, pooled over all of them.
+
+    .. math:: A_{gk} = \frac{r_{gk} - \bar r_g}
+        {\sqrt{\frac1{\sum_i K_i} \sum_i \sum_j (r_{ij} - \bar r_i)^2}}
+
+    So a group whose scores lie closer together than those of others has smaller ones, which
+    :func:`standardised` would blow up.
+
+    Returns:
+        ``[E*, K]``, detached; 0 where masked, and in groups of equal scores, as
+        :func:`standardised`. These count in the deviation.
+
+    Examples:
+        The distances are 1, 1, 7 and 7, the deviation is 5:
+
+        >>> standardised_in_batch(torch.tensor([[0.0, 2.0], [0.0, 14.0]]))
+        tensor([[-0.2000,  0.2000],
+                [-1.4000,  1.4000]])
+    """
+    distance = _spread(score, sample_dim=sample_dim, mask=mask)
+    real = None if mask is None else mask.expand_as(distance).flatten()
+    return _in_deviations(distance.flatten(), mask=real).view_as(distance)
 
 
 def leave_one_out(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None) -> Tensor:
@@ -1119,6 +1137,25 @@ def log_mean_exp(values: Tensor, *, sample_dim: int = -1, mask: Tensor | None = 
     """
     _check_samples(sample_dim, mask, values=values)
     return _masked_logsumexp(values + _log_uniform(values, sample_dim, mask), sample_dim, mask)
+
+
+def _spread(score: Tensor, *, sample_dim: int, mask: Tensor | None) -> Tensor:
+    """Centred scores; 0 in a group whose scores are equal up to rounding."""
+    distance = centred(score, sample_dim=sample_dim, mask=mask)
+    real = torch.ones_like(distance, dtype=torch.bool) if mask is None else mask
+    highest = score.detach().where(real, -math.inf).amax(sample_dim, keepdim=True)
+    lowest = score.detach().where(real, math.inf).amin(sample_dim, keepdim=True)
+    rounding = 8 * torch.finfo(distance.dtype).eps * torch.maximum(highest.abs(), lowest.abs())
+    return distance.where(highest - lowest > rounding, 0.0)
+
+
+def _in_deviations(distance: Tensor, *, sample_dim: int = -1, mask: Tensor | None) -> Tensor:
+    """Distances in units of the root of their mean square; 0 where all are 0."""
+    # Scaled by the largest distance, so that no square under- or overflows.
+    largest = distance.abs().amax(sample_dim, keepdim=True)
+    unit = distance / largest.where(largest > 0, 1.0)
+    variance = masked_mean(unit.square(), sample_dim=sample_dim, mask=mask, keepdim=True)
+    return unit / variance.where(largest > 0, 1.0).sqrt()
 
 
 def _log_uniform(like: Tensor, dim: int, mask: Tensor | None) -> Tensor | float:

@@ -11,7 +11,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from stacked import check_runs, runs_of, train_stack
-from tasks import make_task
+from tasks import Metrics, make_task
 from torch.nn.utils import clip_grad_norm_
 from utils import (
     is_far,

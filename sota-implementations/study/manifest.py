@@ -33,12 +33,14 @@ NOT_THE_RUN = (
     *("env.settings", "env.optim", "env.cracked", "env.num_groups", "env.evaluation_interval"),
     "loss.options.deactivate_vmap",
 )
-# Entries that older runs have or lack, with the value that is or was the only one.
-GONE = {
+# What a run had whose configuration lacks the entry: either the scripts no longer have it, and this
+# is the one value that is left; or they have it only since, and this is how it was.
+IMPLIED = {
     "env.head": "masked",  # the action's parts; independent factors and one softmax had no result
     "loss.length_normalised": False,  # of the entropy term of a lift; true had no result
     "env.distinct_histories": True,  # as TorchRL's LSTMModule has it; the same numbers, slower
     "env.hidden_size": 128,  # of the LSTM, which was the only policy
+    "loss.score": "return",
     "policy.name": "lstm",
     "policy.window": "None",
     "policy.hidden_size": 128,
@@ -173,7 +175,7 @@ def changed_entries(
         >>> changed_entries({"tau": 0.5, "a.b": 1}, {"tau": 0.1}, ignored=["a"])
         ['tau was 0.5, is 0.1']
     """
-    changes = differences({**GONE, **old}, {**GONE, **new})
+    changes = differences({**IMPLIED, **old}, {**IMPLIED, **new})
     ignored = (*NOT_THE_RUN, *ignored)
     return [words for name, words in changes.items() if not _is_below(name, ignored)]
 

@@ -53,13 +53,14 @@ def call(case, kind):
 
 def subject(name, kind):
     case = SUBJECTS[name]
-    options = {**case.temperatures, **case.options, "reduction": "none"}
+    options = {"score": "return", **case.temperatures, **case.options, "reduction": "none"}
     if name in (*DELAYED, "reps"):
         options["delay_actor"] = False
     if name in ("ecpo", "reps"):
         options["control_variate"] = False
     if name == "trust_pcl":
         options |= {"delay_actor": False, "gamma": 0.9, "n_steps": 2}
+        del options["score"]  # it is of rewards, not of returns
     networks = dict.fromkeys(NETWORKS[: 1 + (name == "trust_pcl")], NO_NETWORKS)
     made = {"actor_network": lambda: make_actor(kind), "value_network": make_value}
     entries = good(kind) | options | {network: made[network] for network in networks}

@@ -11,6 +11,7 @@ from torch.testing import assert_close
 from torchrl.objectives import HardUpdate
 from trajectory_problems import (
     CASES,
+    DELAYED,
     expected_losses,
     gradients,
     make_actor,
@@ -21,6 +22,7 @@ from trajectory_problems import (
     problem,
     reinforce,
     sample,
+    scored,
     scores,
     split,
 )
@@ -58,6 +60,69 @@ def test_defaults(loss_class, tau, tau_prime):
         assert_close(loss.tau_prime, torch.tensor(tau_prime))
     assert (loss.delay_actor, loss.reduction) == (False, "mean")
     assert not getattr(loss, "control_variate", False)
+
+
+# ------------------------------------------------------------------------------------- the scores
+
+every_score = pytest.mark.parametrize("score", ["return", "group", "batch"])
+
+
+@every_score
+@pytest.mark.parametrize(
+    ("name", "delayed"), [*[(name, False) for name in CASES], *[(name, True) for name in DELAYED]]
+)
+def test_scores_take_the_place_of_the_returns(name, delayed, score):
+    case = replace(CASES[name], options=CASES[name].options | {"score": score})
+    options = {"delay_actor": True} if delayed else {}
+    loss, actor, batch = problem(case, lag=0.1 * delayed, **options)
+    reference = [make_actor()] if delayed else []
+    for each in reference:
+        move(each, 0.1)
+    groups = [numbers(actor, group, *reference) for group in split(batch)]
+    options = {k: "return" if k == "score" else v for k, v in CASES[name].options.items()}
+    expected = torch.stack(
+        [case.formula(n, **case.temperatures, **options)[0] for n in scored(groups, score)]
+    ).mean()
+    out = loss(batch)
+    assert_close(out["loss_actor"], expected)
+    assert_close(gradients(out["loss_actor"], actor), gradients(expected, actor))
+    assert_close(out["return"], torch.stack([n.returns.mean() for n in groups]).mean())
+
+
+@pytest.mark.parametrize("score", ["group", "batch"])
+def test_reps_bounds_the_lift_by_scores(score):
+    """As if each trajectory's score were its first reward, and its only one."""
+    actor = make_actor()
+    batch = sample(actor, 5, 6, 4)
+    groups = scored([numbers(actor, group) for group in split(batch)], score)
+    with_scores = batch.clone()
+    with_scores["next", "reward"].zero_()
+    with_scores["next", "reward"][..., 0, 0] = torch.stack([n.returns for n in groups])
+    names = ("loss_actor", "loss_tau", "kl_target_reference", "ESS", "max_weight")
+    expected = REPSLoss(actor).double()(with_scores).select(*names)
+    assert_close(REPSLoss(actor, score=score).double()(batch).select(*names), expected)
+
+
+@pytest.mark.parametrize("score", ["group", "batch"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_equal_returns_have_scores_of_zero(score, dtype):
+    """Also where the order of a sum makes a difference in the last places."""
+    actor = make_actor(dtype=dtype)
+    batch = sample(actor, 2, 3, 4)
+    orders = torch.tensor([[0, 1, 2, 3], [0, 2, 1, 3], [0, 3, 1, 2]])
+    rewards = torch.tensor([0.1, 0.2, 0.6, 0.9], dtype=dtype)
+    batch["next", "reward"] = rewards[orders].unsqueeze(-1).expand(2, 3, 4, 1)
+    loss = GRPOLoss(actor, score=score)
+    assert len(loss._read(batch).returns.unique()) > 1
+    assert (loss._read(batch).scores == 0).all()
+    assert loss(batch)["loss_actor"] == 0
+
+
+@pytest.mark.parametrize("loss_class", [*(case.loss for case in CASES.values()), REPSLoss])
+def test_unknown_scores_are_refused(loss_class):
+    message = r"score must be one of \('return', 'group', 'batch'\), got 'foo'"
+    with pytest.raises(ValueError, match=message):
+        loss_class(make_actor(), score="foo")
 
 
 # -------------------------------------------------------------------------------------------- ECPO

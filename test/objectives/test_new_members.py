@@ -114,7 +114,8 @@ def test_grpo_by_hand():
     steps = Steps(
         torch.tensor([[1.0], [0.0]]), log_prob, log_prob + d, log_prob - ratio.log(), None
     )
-    groups = TrajectoryGroups(*(values.sum(-1).double() for values in steps[:4]), None, steps)
+    returns, *log_probs = (values.sum(-1).double() for values in steps[:4])
+    groups = TrajectoryGroups(returns, *log_probs, None, steps, returns)
     found = loss.surrogate(groups)
     # min(1.5, 1.2) and min(-0.5, -0.8); penalties 2 - log 2 - 1 and 0.
     penalty = 0.1 * (1 - d[0, 0].item())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -361,6 +361,18 @@ def scores(n: Numbers, score: str) -> Tensor:
     """Returns less their mean, in units of their deviation if there is one."""
     centred = n.returns - n.returns.mean()
     return centred / n.returns.std(correction=0).clamp_min(1e-9) if score == "group" else centred
+
+
+def scored(groups: list[Numbers], score: str) -> list[Numbers]:
+    """The groups of a batch, with scores for returns."""
+    if score == "return":
+        return groups
+    distances = [n.returns - n.returns.mean() for n in groups]
+    within = [torch.cat(distances)] * len(groups) if score == "batch" else distances
+    return [
+        replace(n, returns=distance / of.square().mean().sqrt())
+        for n, distance, of in zip(groups, distances, within, strict=True)
+    ]
 
 
 def grpo(

@@ -8,7 +8,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 
 from torchrl_ecpo.checks import check_flag
 from torchrl_ecpo.functional import Surrogate, mean_seeking_projection
-from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, TrajectoryGroups
+from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, Score, TrajectoryGroups
 
 __all__ = ["ECPOLoss"]
 
@@ -30,16 +30,17 @@ class ECPOLoss(LiftProjectLoss):
         actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.
 
     Keyword Args:
-        tau: temperature of the divergence from the reference policy, in the unit of the return.
+        tau: temperature of the divergence from the reference policy, in the unit of the score.
             Defaults to 0.5, the middle of the values searched on the algorithmic tasks (rewards of
             1 a symbol), where 0.25 or 1 was best.
-        tau_prime: temperature of the entropy, in the unit of the return. What matters is
+        tau_prime: temperature of the entropy, in the unit of the score. What matters is
             tau_prime / (tau + tau_prime). Defaults to 0.01, where the runs on the same tasks
             start; anneal it towards 0 where the task asks for a deterministic policy. 0 is the
             paper's ablation.
         control_variate: if True, the self-normalised ratios pi_theta/pi_bar are subtracted from
             the weights, which removes the drift of groups without a preference. Defaults to False
             (the paper).
+        score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
         delay_actor: if True, the reference policy is the loss's own delayed copy of the actor, see
             :class:`TrajectoryGroupLoss`. Defaults to False: the recorded log-probability is the
             reference's, as in Algorithm 1.
@@ -84,6 +85,7 @@ class ECPOLoss(LiftProjectLoss):
         tau: float = 0.5,
         tau_prime: float = 0.01,
         control_variate: bool = False,
+        score: Score = "return",
         delay_actor: bool = False,
         reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
@@ -91,6 +93,7 @@ class ECPOLoss(LiftProjectLoss):
             actor_network,
             tau=tau,
             tau_prime=tau_prime,
+            score=score,
             delay_actor=delay_actor,
             reduction=reduction,
         )

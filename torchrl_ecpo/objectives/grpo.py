@@ -12,12 +12,13 @@ from torch import Tensor
 from torchrl_ecpo.checks import as_float, check_choice
 from torchrl_ecpo.functional import (
     Surrogate,
+    centred,
     clipped_gain,
     divergence_penalty,
     masked_mean,
     self_normalised_weights,
 )
-from torchrl_ecpo.objectives.trajectory import SCORES, TrajectoryGroupLoss, TrajectoryGroups
+from torchrl_ecpo.objectives.trajectory import Score, TrajectoryGroupLoss, TrajectoryGroups
 
 __all__ = ["GRPOLoss"]
 
@@ -42,8 +43,8 @@ class GRPOLoss(TrajectoryGroupLoss):
 
     Keyword Args:
         clip_epsilon: epsilon, or (epsilon_low, epsilon_high). Defaults to 0.2 (PPO).
-        score: A: ``"group"`` (default), returns standardised within their group, or ``"return"``,
-            less their mean only.
+        score: A, see :class:`TrajectoryGroupLoss`. Defaults to ``"group"``; of ``"return"`` the
+            group's mean is taken off, too.
         aggregation: ``"prompt_mean"`` (default), the mean over a trajectory's steps, c = 1;
             ``"prompt_sum"``, their sum, c = T; ``"token_mean"``, over all steps, c = T / mean T.
         ratio: of each ``"step"`` (default), or of the ``"trajectory"``: their geometric mean.
@@ -71,7 +72,7 @@ class GRPOLoss(TrajectoryGroupLoss):
         actor_network: ProbabilisticTensorDictSequential,
         *,
         clip_epsilon: float | tuple[float, float] = 0.2,
-        score: Literal["group", "return"] = "group",
+        score: Score = "group",
         aggregation: Literal["prompt_mean", "prompt_sum", "token_mean"] = "prompt_mean",
         ratio: Literal["step", "trajectory"] = "step",
         kl_to_ref_coeff: float = 0.0,
@@ -82,6 +83,7 @@ class GRPOLoss(TrajectoryGroupLoss):
             actor_network,
             temperatures={"kl_to_ref_coeff": kl_to_ref_coeff},
             allow_zero=True,
+            score=score,
             delay_actor=delay_actor,
             reduction=reduction,
         )
@@ -90,15 +92,15 @@ class GRPOLoss(TrajectoryGroupLoss):
         self.clip_low, self.clip_high = (as_float("clip_epsilon", each) for each in pair)
         if not (0 <= self.clip_low < 1 and 0 <= self.clip_high < math.inf):
             raise ValueError(f"clip_epsilon must be >= 0, and < 1 downwards, got {clip_epsilon}.")
-        self.score, self.aggregation, self.ratio = score, aggregation, ratio
-        check_choice("score", score, tuple(SCORES))
+        self.aggregation, self.ratio = aggregation, ratio
         check_choice("aggregation", aggregation, ("prompt_mean", "prompt_sum", "token_mean"))
         check_choice("ratio", ratio, ("step", "trajectory"))
 
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
         """The clipped gain less the penalty; the weights are the trajectories' ratios."""
         steps, mask = groups.steps, groups.mask
-        advantage = SCORES[self.score](groups.returns, mask=mask).unsqueeze(-1)
+        scores = groups.scores
+        advantage = (centred(scores, mask=mask) if self.score == "return" else scores).unsqueeze(-1)
         log_ratio = steps.log_prob - steps.behaviour_log_prob
         if self.ratio == "trajectory":
             log_ratio = masked_mean(log_ratio, mask=steps.mask, keepdim=True).expand_as(log_ratio)

@@ -8,7 +8,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
 from torchrl_ecpo.functional import Surrogate, ment_surrogate
-from torchrl_ecpo.objectives.trajectory import TrajectoryGroupLoss, TrajectoryGroups
+from torchrl_ecpo.objectives.trajectory import Score, TrajectoryGroupLoss, TrajectoryGroups
 
 __all__ = ["MENTLoss"]
 
@@ -28,8 +28,9 @@ class MENTLoss(TrajectoryGroupLoss):
         actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.
 
     Keyword Args:
-        tau: temperature of the entropy, in the unit of the return; 0 is plain REINFORCE. Defaults
+        tau: temperature of the entropy, in the unit of the score; 0 is plain REINFORCE. Defaults
             to 0.01, the UREX paper's setting for this baseline.
+        score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
         reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
     Examples:
@@ -50,12 +51,17 @@ class MENTLoss(TrajectoryGroupLoss):
         actor_network: ProbabilisticTensorDictSequential,
         *,
         tau: float = 0.01,
+        score: Score = "return",
         reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
         super().__init__(
-            actor_network, temperatures={"tau": tau}, allow_zero=True, reduction=reduction
+            actor_network,
+            temperatures={"tau": tau},
+            allow_zero=True,
+            score=score,
+            reduction=reduction,
         )
 
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
-        """REINFORCE on the return less tau log pi."""
-        return ment_surrogate(groups.log_prob, groups.returns, tau=self.tau, mask=groups.mask)
+        """REINFORCE on the score less tau log pi."""
+        return ment_surrogate(groups.log_prob, groups.scores, tau=self.tau, mask=groups.mask)

@@ -26,9 +26,10 @@ class PMDLoss(LiftProjectLoss):
         actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.
 
     Keyword Args:
-        tau: temperature of the divergence from the reference policy, in the unit of the return.
+        tau: temperature of the divergence from the reference policy, in the unit of the score.
             Defaults to 0.5, as :class:`ECPOLoss`.
         tau_prime: temperature of the entropy. Defaults to 0 (the paper's PMD).
+        score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
         delay_actor: see :class:`ECPOLoss`. Defaults to False.
         reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
@@ -43,7 +44,7 @@ class PMDLoss(LiftProjectLoss):
     """
 
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
-        """Eq. 3 in the unit of the return: the projection's gradient times tau + tau'."""
+        """Eq. 3 in the unit of the score: the projection's gradient times tau + tau'."""
         projection = mode_seeking_projection(
             groups.log_prob,
             groups.reference_log_prob,

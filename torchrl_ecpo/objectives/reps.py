@@ -10,7 +10,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl_ecpo.checks import as_float
 from torchrl_ecpo.functional import Surrogate, lift_divergence_estimate, self_normalised_weights
 from torchrl_ecpo.objectives.ecpo import ECPOLoss
-from torchrl_ecpo.objectives.trajectory import TrajectoryGroups
+from torchrl_ecpo.objectives.trajectory import Score, TrajectoryGroups
 
 __all__ = ["REPSLoss"]
 
@@ -35,9 +35,10 @@ class REPSLoss(ECPOLoss):
     Keyword Args:
         epsilon: how far the lift goes, in nats; above 0, and below log K. Defaults to 0.5
             (ours).
-        tau: where the temperature starts. Defaults to 1.
+        tau: where the temperature starts, in the unit of the score. Defaults to 1.
         tau_prime: temperature of the entropy. Defaults to 0 (REPS has none).
         control_variate: see :class:`ECPOLoss`. Defaults to False.
+        score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
         delay_actor: see :class:`ECPOLoss`. Defaults to False.
         reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
@@ -67,6 +68,7 @@ class REPSLoss(ECPOLoss):
         tau: float = 1.0,
         tau_prime: float = 0.0,
         control_variate: bool = False,
+        score: Score = "return",
         delay_actor: bool = False,
         reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
@@ -75,6 +77,7 @@ class REPSLoss(ECPOLoss):
             tau=tau,
             tau_prime=tau_prime,
             control_variate=control_variate,
+            score=score,
             delay_actor=delay_actor,
             reduction=reduction,
         )

@@ -13,7 +13,7 @@ from torchrl_ecpo.functional import (
     uniform_weights,
 )
 from torchrl_ecpo.objectives.ment import MENTLoss
-from torchrl_ecpo.objectives.trajectory import TrajectoryGroups
+from torchrl_ecpo.objectives.trajectory import Score, TrajectoryGroups
 
 __all__ = ["RLOOLoss"]
 
@@ -33,8 +33,9 @@ class RLOOLoss(MENTLoss):
         actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.
 
     Keyword Args:
-        tau: temperature of the entropy, in the unit of the return. Defaults to 0 (RLOO as
+        tau: temperature of the entropy, in the unit of the score. Defaults to 0 (RLOO as
             published).
+        score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
         reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
     Examples:
@@ -51,13 +52,14 @@ class RLOOLoss(MENTLoss):
         actor_network: ProbabilisticTensorDictSequential,
         *,
         tau: float = 0.0,
+        score: Score = "return",
         reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
-        super().__init__(actor_network, tau=tau, reduction=reduction)
+        super().__init__(actor_network, tau=tau, score=score, reduction=reduction)
 
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
-        """REINFORCE on the return less tau log pi, against the others."""
+        """REINFORCE on the score less tau log pi, against the others."""
         mask, log_prob = groups.mask, groups.log_prob
-        advantage = leave_one_out(groups.returns - self.tau * log_prob.detach(), mask=mask)
+        advantage = leave_one_out(groups.scores - self.tau * log_prob.detach(), mask=mask)
         loss = score_function_loss(log_prob, advantage, mask=mask)
         return Surrogate(loss, uniform_weights(log_prob, mask=mask))

@@ -8,7 +8,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 
 from torchrl_ecpo.checks import check_choice
 from torchrl_ecpo.functional import Surrogate, squared_residual_projection
-from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, TrajectoryGroups
+from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, Score, TrajectoryGroups
 
 __all__ = ["SquaredPMDLoss"]
 
@@ -31,11 +31,12 @@ class SquaredPMDLoss(LiftProjectLoss):
         actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.
 
     Keyword Args:
-        tau: temperature of the divergence from the reference policy, in the unit of the return.
+        tau: temperature of the divergence from the reference policy, in the unit of the score.
             Defaults to 0.5, as :class:`ECPOLoss`.
         tau_prime: temperature of the entropy. Defaults to 0 (Kimi k1.5).
         normaliser: of the target: ``"mean"`` (default, Kimi's in practice), the mean return, or
             ``"soft"``, the soft value.
+        score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
         delay_actor: see :class:`ECPOLoss`. Defaults to False.
         reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
@@ -56,6 +57,7 @@ class SquaredPMDLoss(LiftProjectLoss):
         tau: float = 0.5,
         tau_prime: float = 0.0,
         normaliser: Literal["mean", "soft"] = "mean",
+        score: Score = "return",
         delay_actor: bool = False,
         reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
@@ -63,6 +65,7 @@ class SquaredPMDLoss(LiftProjectLoss):
             actor_network,
             tau=tau,
             tau_prime=tau_prime,
+            score=score,
             delay_actor=delay_actor,
             reduction=reduction,
         )
@@ -70,7 +73,7 @@ class SquaredPMDLoss(LiftProjectLoss):
         self.normaliser = normaliser
 
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
-        """The squared residual in the unit of the return."""
+        """The squared residual in the unit of the score."""
         projection = squared_residual_projection(
             groups.log_prob,
             groups.reference_log_prob,

@@ -7,9 +7,9 @@ from typing import Literal
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
-from torchrl_ecpo.checks import check_choice, check_flag
+from torchrl_ecpo.checks import check_flag
 from torchrl_ecpo.functional import Surrogate, group_cross_entropy
-from torchrl_ecpo.objectives.trajectory import SCORES, TrajectoryGroupLoss, TrajectoryGroups
+from torchrl_ecpo.objectives.trajectory import Score, TrajectoryGroupLoss, TrajectoryGroups
 
 __all__ = ["TPOLoss"]
 
@@ -33,9 +33,8 @@ class TPOLoss(TrajectoryGroupLoss):
         actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.
 
     Keyword Args:
-        tau: temperature of the scores, the paper's eta. Defaults to 1 (the paper).
-        score: u: ``"group"`` (default), returns standardised within their group, or ``"return"``,
-            in their own unit.
+        tau: temperature, in the unit of the score: the paper's eta. Defaults to 1 (the paper).
+        score: u, see :class:`TrajectoryGroupLoss`. Defaults to ``"group"`` (the paper).
         length_norm: if True, log-probabilities are divided by the number of steps, in p and in q.
             Defaults to False.
         delay_actor: see :class:`ECPOLoss`. Defaults to False. Nothing corrects for another policy
@@ -58,7 +57,7 @@ class TPOLoss(TrajectoryGroupLoss):
         actor_network: ProbabilisticTensorDictSequential,
         *,
         tau: float = 1.0,
-        score: Literal["group", "return"] = "group",
+        score: Score = "group",
         length_norm: bool = False,
         delay_actor: bool = False,
         reduction: Literal["none", "mean", "sum"] | None = None,
@@ -66,11 +65,11 @@ class TPOLoss(TrajectoryGroupLoss):
         super().__init__(
             actor_network,
             temperatures={"tau": tau},
+            score=score,
             delay_actor=delay_actor,
             reduction=reduction,
         )
-        check_choice("score", score, tuple(SCORES))
-        self.score, self.length_norm = score, check_flag("length_norm", length_norm)
+        self.length_norm = check_flag("length_norm", length_norm)
 
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
         """The cross-entropy; its weights are q."""
@@ -78,5 +77,4 @@ class TPOLoss(TrajectoryGroupLoss):
         if self.length_norm:
             length = groups.num_steps.clamp_min(1)
             log_prob, reference = log_prob / length, reference / length
-        score = SCORES[self.score](groups.returns, mask=groups.mask)
-        return group_cross_entropy(log_prob, score / self.tau + reference, mask=groups.mask)
+        return group_cross_entropy(log_prob, groups.scores / self.tau + reference, mask=groups.mask)

@@ -23,6 +23,7 @@ from torch.distributions import Categorical
 
 from torchrl_ecpo.checks import (
     UNREADABLE,
+    check_choice,
     check_group_size,
     check_integers,
     check_padding,
@@ -33,11 +34,11 @@ from torchrl_ecpo.checks import (
 )
 from torchrl_ecpo.functional import (
     Surrogate,
-    centred,
     effective_sample_size,
     lifted_log_weights,
     self_normalised_weights,
     standardised,
+    standardised_in_batch,
     uniform_weights,
 )
 from torchrl_ecpo.groups import DONE_KEY, GROUP_KEY
@@ -54,8 +55,12 @@ from torchrl_ecpo.objectives._base import PolicyLoss, Reduction
 
 __all__ = ["LiftProjectLoss", "Steps", "TrajectoryGroupLoss", "TrajectoryGroups"]
 
-SCORES = {"return": centred, "group": standardised}
-"""What a loss may take for the score: returns in their unit, or in their group's deviation."""
+SCORES = {
+    "return": lambda returns, mask: returns,
+    "group": standardised,
+    "batch": standardised_in_batch,
+}
+Score = Literal["return", "group", "batch"]
 OF_WEIGHTS = ("ESS", "max_weight")
 OF_GROUPS = ("kl_reference_policy", "entropy", "return", "equal_return_groups")
 
@@ -92,6 +97,8 @@ class TrajectoryGroups(NamedTuple):
     """True where the trajectory has a real step; None where all have."""
     steps: Steps
     """What was summed, for losses of single steps."""
+    scores: Tensor
+    """What is to be maximised: the returns, or what the loss's ``score`` makes of them."""
 
     @property
     def num_steps(self) -> Tensor:
@@ -135,8 +142,13 @@ class TrajectoryGroupLoss(PolicyLoss):
     Keyword Args:
         temperatures: initial values by name; each becomes a buffer that is scheduled by assignment
             (``loss.tau = 0.1``) and by :class:`~torchrl_ecpo.TemperatureScheduler`. In the unit of
-            the return.
+            the score.
         allow_zero: whether all temperatures may be 0 together. Defaults to False.
+        score: what takes the place of the return: ``"return"`` (default), itself; or its distance
+            from the mean of its group, in units of the standard deviation of the ``"group"``
+            (:func:`~torchrl_ecpo.functional.standardised`) or of the ``"batch"``, within its
+            groups (:func:`~torchrl_ecpo.functional.standardised_in_batch`). These two are without
+            a unit, and so are the temperatures then. The batch is that of one call.
         delay_actor: if True, the loss keeps ``target_actor_network_params`` as reference policy, to
             be moved by an updater (:mod:`torchrl_ecpo.updaters`), and corrects for the policy that
             drew the trajectories where its log-probability is recorded. If False (default, and
@@ -145,11 +157,12 @@ class TrajectoryGroupLoss(PolicyLoss):
             for each group.
 
     Raises:
-        ValueError: for an unknown reduction or a temperature that is not allowed; when called, for
-            a wrong shape, a group of one, also one that the mask leaves, a mask with a hole, rows
-            that mix groups (``"group"``) or go on after an end (``("next", "done")``), a reward,
-            log-probability or temperature that is not finite. (``torch.compile`` and ``torch.vmap``
-            look at shapes only: NaN then gives NaN, and a mask without a real step gives 0.)
+        ValueError: for an unknown score or reduction or a temperature that is not allowed; when
+            called, for a wrong shape, a group of one, also one that the mask leaves, a mask with a
+            hole, rows that mix groups (``"group"``) or go on after an end (``("next", "done")``),
+            a reward, log-probability or temperature that is not finite. (``torch.compile`` and
+            ``torch.vmap`` look at shapes only: NaN then gives NaN, and a mask without a real step
+            gives 0.)
         TypeError: if ``actor_network`` has no ``get_dist``.
         KeyError: when called, for a missing entry.
 
@@ -160,8 +173,8 @@ class TrajectoryGroupLoss(PolicyLoss):
         >>> class RLOOLoss(TrajectoryGroupLoss):
         ...     metrics = ("advantage",)
         ...     def surrogate(self, groups):
-        ...         K = groups.returns.shape[-1]
-        ...         advantage = centred(groups.returns) * K / (K - 1)
+        ...         K = groups.scores.shape[-1]
+        ...         advantage = centred(groups.scores) * K / (K - 1)
         ...         loss = score_function_loss(groups.log_prob, advantage)
         ...         return Surrogate(loss, None, metrics={"advantage": advantage.abs().mean(-1)})
     """
@@ -207,6 +220,7 @@ class TrajectoryGroupLoss(PolicyLoss):
         *,
         temperatures: Mapping[str, float] | None = None,
         allow_zero: bool = False,
+        score: Score = "return",
         delay_actor: bool = False,
         reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
@@ -217,6 +231,8 @@ class TrajectoryGroupLoss(PolicyLoss):
             delay_actor=delay_actor,
             reduction=reduction,
         )
+        check_choice("score", score, tuple(SCORES))
+        self.score = score
         self._check_names()
         self._may_squash = any(map(may_squash, self._heads))
 
@@ -310,7 +326,8 @@ class TrajectoryGroupLoss(PolicyLoss):
         quantities[read + "reference policy"] = reference
         quantities[read + "actor"] = log_prob
         self._check_values(quantities, of="trajectories")
-        return TrajectoryGroups(returns, log_prob, reference, behaviour, mask, steps)
+        scores = SCORES[self.score](returns, mask=mask)
+        return TrajectoryGroups(returns, log_prob, reference, behaviour, mask, steps, scores)
 
     def _read_steps(self, tensordict: TensorDictBase) -> Steps:
         reward = get_entry(tensordict, self._reward_key)
@@ -539,9 +556,10 @@ class LiftProjectLoss(TrajectoryGroupLoss):
     """A :class:`TrajectoryGroupLoss` that lifts a reference policy by Eq. 5 and projects onto it.
 
     Keyword Args:
-        tau: temperature of the divergence from the reference policy, in the unit of the return.
+        tau: temperature of the divergence from the reference policy, in the unit of the score.
             Defaults to 0.5, the middle of the values searched on the algorithmic tasks.
-        tau_prime: temperature of the entropy, in the unit of the return. Defaults to 0.
+        tau_prime: temperature of the entropy, in the unit of the score. Defaults to 0.
+        score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
     """
 
     tau: Tensor
@@ -553,12 +571,14 @@ class LiftProjectLoss(TrajectoryGroupLoss):
         *,
         tau: float = 0.5,
         tau_prime: float = 0.0,
+        score: Score = "return",
         delay_actor: bool = False,
         reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
         super().__init__(
             actor_network,
             temperatures={"tau": tau, "tau_prime": tau_prime},
+            score=score,
             delay_actor=delay_actor,
             reduction=reduction,
         )
@@ -567,7 +587,7 @@ class LiftProjectLoss(TrajectoryGroupLoss):
         """Log-weight ``[*G, K]`` of the lifted policy relative to the reference: Eq. 5."""
         tau, tau_prime = self.temperatures()
         return lifted_log_weights(
-            groups.returns, groups.reference_log_prob, tau=tau, tau_prime=tau_prime
+            groups.scores, groups.reference_log_prob, tau=tau, tau_prime=tau_prime
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Literal
 
 from tensordict import TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
@@ -115,10 +115,15 @@ class TrustPCLLoss(LiftProjectLoss):
         gamma: float = 1.0,
         n_steps: int = 10,
         delay_actor: bool = True,
-        **options: Any,
+        reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
-        temperatures = {"tau": tau, "tau_prime": tau_prime}
-        super().__init__(actor_network, **temperatures, delay_actor=delay_actor, **options)
+        super().__init__(
+            actor_network,
+            tau=tau,
+            tau_prime=tau_prime,
+            delay_actor=delay_actor,
+            reduction=reduction,
+        )
         check_network("value_network", value_network)
         self.gamma = as_fraction("gamma", gamma)
         self.n_steps = check_count("n_steps", n_steps)

@@ -8,7 +8,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
 from torchrl_ecpo.functional import Surrogate, urex_surrogate
-from torchrl_ecpo.objectives.trajectory import TrajectoryGroupLoss, TrajectoryGroups
+from torchrl_ecpo.objectives.trajectory import Score, TrajectoryGroupLoss, TrajectoryGroups
 
 __all__ = ["UREXLoss"]
 
@@ -27,7 +27,8 @@ class UREXLoss(TrajectoryGroupLoss):
         actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.
 
     Keyword Args:
-        tau: temperature, in the unit of the return; above 0. Defaults to 0.1, the UREX paper's.
+        tau: temperature, in the unit of the score; above 0. Defaults to 0.1, the UREX paper's.
+        score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
         reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
     Examples:
@@ -48,10 +49,11 @@ class UREXLoss(TrajectoryGroupLoss):
         actor_network: ProbabilisticTensorDictSequential,
         *,
         tau: float = 0.1,
+        score: Score = "return",
         reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
-        super().__init__(actor_network, temperatures={"tau": tau}, reduction=reduction)
+        super().__init__(actor_network, temperatures={"tau": tau}, score=score, reduction=reduction)
 
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
         """The gradient of the UREX objective."""
-        return urex_surrogate(groups.log_prob, groups.returns, tau=self.tau, mask=groups.mask)
+        return urex_surrogate(groups.log_prob, groups.scores, tau=self.tau, mask=groups.mask)
