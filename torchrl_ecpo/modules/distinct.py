@@ -39,6 +39,8 @@ class Evaluated(NamedTuple):
     """`[n, *]`."""
     states: Mapping[NestedKey, Tensor]
     """What each hands to the next step, `[n, *]`; read in sampling."""
+    pasts: Tensor | None = None
+    """Each as a number `[n]`, of which the core's `read_out` makes the output, if it can."""
 
 
 class DistinctCore(TensorDictModuleBase):
@@ -109,19 +111,13 @@ class DistinctCore(TensorDictModuleBase):
         Returns:
             The same tensordict.
         """
-        return self.write(tensordict, *self.read(tensordict))
+        return self.write(tensordict, self.read(tensordict))
 
-    def write(
-        self,
-        tensordict: TensorDictBase,
-        nodes: Tensor,
-        output: Tensor,
-        states: Mapping[NestedKey, Tensor],
-    ) -> TensorDictBase:
+    def write(self, tensordict: TensorDictBase, found: Evaluated) -> TensorDictBase:
         """Write what was evaluated at its places."""
-        tensordict.set(self.out_keys[0], take_rows(output, nodes))
-        for key, value in states.items():
-            tensordict.set(("next", key), take_rows(value, nodes))
+        tensordict.set(self.out_keys[0], take_rows(found.output, found.nodes))
+        for key, value in found.states.items():
+            tensordict.set(("next", key), take_rows(value, found.nodes))
         return tensordict
 
     @names_entries
@@ -146,17 +142,15 @@ class DistinctCore(TensorDictModuleBase):
                     "is_init: expected every sequence to begin with a trajectory's first step, "
                     "since states are not stored, and some do not; keep trajectories whole."
                 )
-            nodes, output, _ = self.evaluate(symbols, starts, mask)
-            return Evaluated(nodes.t().reshape(shape), output, {})
+            found = self.evaluate(symbols, starts, mask)
+            return found._replace(nodes=found.nodes.t().reshape(shape), states={})
         ended = tensordict.get("done", None)
         if ended is not None:
             ended = ended.reshape(shape)
             starts, symbols = starts | ended, symbols.masked_fill(ended, 0)
         symbols, starts = symbols.reshape(1, -1), starts.reshape(1, -1)
-        nodes, output, states = self.evaluate(
-            symbols, starts, states=self._states(tensordict, starts)
-        )
-        return Evaluated(nodes.view(shape), output, states)
+        found = self.evaluate(symbols, starts, states=self._states(tensordict, starts))
+        return found._replace(nodes=found.nodes.view(shape))
 
     def read_symbols(self, tensordict: TensorDictBase) -> Tensor:
         """The input tuple as one number, int64 `[*B]`."""

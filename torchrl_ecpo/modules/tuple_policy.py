@@ -180,8 +180,14 @@ class TupleCategorical(Distribution):
 
     def _score(self, value: Tensor) -> Tensor:
         """Log-probability of actions within range."""
-        log_probs, rows = self._log_probs, self._rows
-        shape = value.shape[:-1]
+        return self.log_prob_at(self.places(value))
+
+    def places(self, value: Tensor) -> Tensor:
+        """Where the log-probabilities of actions `[..., 3]` are, for :meth:`log_prob_at`.
+
+        They are the same in any distribution with the same `rows`.
+        """
+        shape, rows = value.shape[:-1], self._rows
         if shape != self.batch_shape:
             try:
                 shape = torch.broadcast_shapes(shape, self.batch_shape)
@@ -193,11 +199,17 @@ class TupleCategorical(Distribution):
         if rows is None:
             rows = torch.arange(self.batch_shape.numel(), device=value.device)
             rows = rows.view(self.batch_shape)
-        factors, width = log_probs.shape[-2:]
+        factors, width = self._log_probs.shape[-2:]
         first = rows.unsqueeze(-1) * factors + torch.arange(factors, device=value.device)
-        index = (first * width + value).expand(*shape, -1)
-        move, write, character = take_rows(log_probs.flatten(), index).unbind(-1)
-        return move + write + character.where(value[..., 1] == 1, 0)
+        places = (first * width + value).expand(*shape, -1)
+        # A character that is not written counts 0, which is what the last place has.
+        is_idle = torch.zeros_like(value, dtype=torch.bool)
+        is_idle[..., 2] = value[..., 1] == 0
+        return places.masked_fill(is_idle, self._log_probs.numel())
+
+    def log_prob_at(self, places: Tensor) -> Tensor:
+        """Log-probability of the actions whose :meth:`places` these are, `[...]`."""
+        return take_rows(F.pad(self._log_probs.flatten(), (0, 1)), places).sum(-1)
 
     def entropy(self) -> Tensor:
         """Exact entropy of the tuple, in nats, `[*B]`."""
@@ -414,7 +426,7 @@ class _TupleActor(TuplePolicy, ProbabilisticActor):
             return super().forward(*args, **kwargs)
         distribution, read = self.read(args[0])
         action, log_prob = distribution.sample_and_log_prob()
-        tensordict = core.write(args[0], *read)
+        tensordict = core.write(args[0], read)
         return tensordict.set("action", action).set("action_log_prob", log_prob)
 
 

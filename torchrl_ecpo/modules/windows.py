@@ -126,7 +126,7 @@ class DistinctWindowNetwork(DistinctCore):
         output = self.read_out(present) if output is None else output
         past = (present % self.base ** (self.window - 1)).unsqueeze(1)
         handed_on: Any = dict.fromkeys(self.state_keys, past)
-        return Evaluated(nodes, output, handed_on)
+        return Evaluated(nodes, output, handed_on, present)
 
     @property
     def is_tabular(self) -> bool:

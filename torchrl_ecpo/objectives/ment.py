@@ -44,6 +44,7 @@ class MENTLoss(TrajectoryGroupLoss):
         (torch.Size([3]), tensor([4., 4., 4.]))
     """
 
+    reads_steps = False
     tau: Tensor
 
     def __init__(

@@ -69,7 +69,7 @@ class TPOLoss(TrajectoryGroupLoss):
             delay_actor=delay_actor,
             reduction=reduction,
         )
-        self.length_norm = check_flag("length_norm", length_norm)
+        self.length_norm = self.reads_steps = check_flag("length_norm", length_norm)
 
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
         """The cross-entropy; its weights are q."""

@@ -186,6 +186,10 @@ class TrajectoryGroupLoss(PolicyLoss):
     :meth:`surrogate` returns. A member without weights declares its own metrics only, or none.
     """
 
+    reads_steps: bool = True
+    """Whether :meth:`surrogate` reads ``groups.steps`` or ``groups.num_steps``. Of a loss that does
+    not, the sums over a trajectory's steps may be handed in as a trajectory of one step."""
+
     further_in_keys: Sequence[NestedKey] = ()
     """Entries that networks of the member's own read from ``groups.steps.inputs``."""
 
@@ -562,6 +566,7 @@ class LiftProjectLoss(TrajectoryGroupLoss):
         score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
     """
 
+    reads_steps = False
     tau: Tensor
     tau_prime: Tensor
 

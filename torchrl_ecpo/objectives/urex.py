@@ -42,6 +42,7 @@ class UREXLoss(TrajectoryGroupLoss):
         >>> loss["loss_actor"].backward()
     """
 
+    reads_steps = False
     tau: Tensor
 
     def __init__(

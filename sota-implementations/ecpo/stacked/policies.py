@@ -9,7 +9,7 @@ policies: a gradient arrives where the run alone would have it.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -19,7 +19,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
-from torchrl_ecpo.modules import DistinctHistoryLSTM, DistinctWindowNetwork
+from torchrl_ecpo.modules import DistinctHistoryLSTM, DistinctWindowNetwork, TupleCategorical
 from torchrl_ecpo.modules.distinct import take_rows
 from torchrl_ecpo.modules.histories import Histories, distinct_histories, hash_histories
 from torchrl_ecpo.modules.tuple_policy import TuplePolicy
@@ -47,8 +47,8 @@ class StackedPolicy(TensorDictModuleBase):
     streams: RandomStreams
 
     @abstractmethod
-    def log_prob(self, steps: TensorDictBase) -> Tensor:
-        """Log-probability ``[N, T]`` of the actions of trajectories."""
+    def log_prob(self, steps: TensorDictBase) -> Callable[[], Tensor]:
+        """What gives the log-probability ``[N, T]`` of trajectories, with the weights of the day."""
 
     def copy_run(self, run: int, other: StackedPolicy) -> None:
         """Take over the weights that another stack has for a run."""
@@ -115,9 +115,9 @@ class _SeparatePolicies(StackedPolicy):
         parts: Any = tensordict.split(self._count_rows(tensordict))
         return zip(self.runs, parts, strict=True)
 
-    def log_prob(self, steps: TensorDictBase) -> Tensor:
-        parts = self._parts(steps)
-        return torch.cat([actor.get_dist(part).log_prob(part["action"]) for actor, part in parts])
+    def log_prob(self, steps: TensorDictBase) -> Callable[[], Tensor]:
+        parts = [(actor, part, part["action"]) for actor, part in self._parts(steps)]
+        return lambda: torch.cat([actor.get_dist(part).log_prob(a) for actor, part, a in parts])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write action and log-probability."""
@@ -153,14 +153,23 @@ class _StackedTuplePolicy(TuplePolicy, StackedPolicy):
     def runs(self) -> nn.ModuleList:
         return self.core.cells
 
-    def log_prob(self, steps: TensorDictBase) -> Tensor:
-        with set_recurrent_mode(True):
-            return self.read(steps)[0].log_prob(steps["action"])
+    def log_prob(self, steps: TensorDictBase) -> Callable[[], Tensor]:
+        with set_recurrent_mode(True), torch.no_grad():
+            distribution, found = self.read(steps)
+            places, pasts = distribution.places(steps["action"]), found.pasts
+
+        def evaluate() -> Tensor:
+            if pasts is None:
+                with set_recurrent_mode(True):
+                    return self.read(steps)[0].log_prob_at(places)
+            return TupleCategorical(self.core.read_out(pasts), **self.options).log_prob_at(places)
+
+        return evaluate
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write logits, states, action and log-probability."""
         distribution, read = self.read(tensordict)
-        self.core.write(tensordict, *read)
+        self.core.write(tensordict, read)
         sizes = self._count_rows(tensordict)
         action = distribution.choose(self.streams.uniform(sizes, tensordict["logits"]))
         tensordict.set("action", action)

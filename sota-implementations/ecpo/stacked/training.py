@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -32,8 +32,10 @@ from stacked.policies import stack_policies
 from torchrl_ecpo import TrajectoryGroupLoss
 from torchrl_ecpo.collectors import TrajectoryGroupCollector, shut_down
 from torchrl_ecpo.experiment import Checkpoints, Progress, Run
-from torchrl_ecpo.groups import MASK_KEY
+from torchrl_ecpo.groups import DONE_KEY, GROUP_KEY, MASK_KEY
 from torchrl_ecpo.schedules import TemperatureScheduler
+
+KEYS_OF_LOSSES = ("action", "action_log_prob", MASK_KEY, GROUP_KEY, ("next", "reward"), DONE_KEY)
 
 
 def train_stack(configs: Mapping[str, DictConfig], checkpoints: Checkpoints) -> None:
@@ -129,10 +131,11 @@ class Stack:
     def project(self) -> None:
         """Gradient steps of each run, on fresh trajectories of its reference."""
         groups = next(self._batches)
+        losses_of_runs = self._losses(groups)
         of_steps: list[list[Metrics]] = [[] for _ in self.members]
         stepping = list(range(len(self.members)))
         for epoch in range(max(member.config.epochs for member in self.members)):
-            all_losses = self._losses(groups)
+            all_losses = losses_of_runs()
             for index in list(stepping):
                 config = self.members[index].config
                 if epoch < config.epochs:
@@ -172,12 +175,25 @@ class Stack:
     def _is_due(self, member: Member) -> bool:
         return self.progress.project_steps % member.config.project_steps == 0
 
-    def _losses(self, groups: TensorDictBase) -> list[Any]:
-        """Evaluate the policies once; each run's own loss makes of it what it would alone."""
+    def _losses(self, groups: TensorDictBase) -> Callable[[], list[Any]]:
+        """What evaluates the policies once; each run's own loss makes of it what it would alone."""
         steps = groups.select(*self.policy.in_keys, "action", MASK_KEY, strict=False).flatten(0, 1)
-        log_prob = self.policy.log_prob(steps).view(groups.shape)
-        parts = self._split(groups.copy().set("log_prob", log_prob))
-        return [own.loss_module(part) for own, part in zip(self.members, parts, strict=True)]
+        log_prob = self.policy.log_prob(steps)
+        parts = self._split(groups.select(*KEYS_OF_LOSSES, strict=False))
+        handed = [
+            part if member.loss_module.reads_steps else _summed(part)
+            for member, part in zip(self.members, parts, strict=True)
+        ]
+
+        def evaluate() -> list[Any]:
+            values = log_prob().view(groups.shape).chunk(len(parts))
+            for part, given, value in zip(parts, handed, values, strict=True):
+                own = value[..., : part.shape[-1]]
+                own = own if given is part else own.where(part[MASK_KEY], 0).sum(-1, keepdim=True)
+                given.set("log_prob", own)
+            return [own.loss_module(part) for own, part in zip(self.members, handed, strict=True)]
+
+        return evaluate
 
     def _split(self, groups: TensorDictBase) -> list[TensorDictBase]:
         """The batch of each run, without the padding that longer trajectories of others brought."""
@@ -194,6 +210,15 @@ class Stack:
         except FloatingPointError as error:
             raise FloatingPointError(f"{member.run.name}: {error}") from error
         member.optimizer.step()
+
+
+def _summed(groups: TensorDictBase) -> TensorDictBase:
+    """Each trajectory as one step ``[G, K, 1]``, of what its steps add up to."""
+    mask = groups[MASK_KEY]
+    first = groups.select("action", GROUP_KEY)[..., :1]
+    reward, log_prob = groups["next", "reward"], groups["action_log_prob"]
+    first["next", "reward"] = reward.where(mask.unsqueeze(-1), 0).sum(-2, keepdim=True)
+    return first.set("action_log_prob", log_prob.where(mask, 0).sum(-1, keepdim=True))
 
 
 def _make_member(directory: Path, config: DictConfig, task: Task, **options: Any) -> Member:
