@@ -1081,6 +1081,25 @@ def standardised_in_batch(
     return _in_deviations(distance.flatten(), mask=real).view_as(distance)
 
 
+def pooled_deviation(values: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None) -> Tensor:
+    r"""Standard deviation within groups, pooled over all of them.
+
+    .. math:: \sqrt{\frac1{\sum_i K_i} \sum_i \sum_j (x_{ij} - \bar x_i)^2}
+
+    Returns:
+        0-d, detached.
+
+    Examples:
+        The distances are 1, 1, 7 and 7:
+
+        >>> pooled_deviation(torch.tensor([[0.0, 2.0], [0.0, 14.0]]))
+        tensor(5.)
+    """
+    distance = centred(values, sample_dim=sample_dim, mask=mask)
+    real = None if mask is None else mask.expand_as(distance).flatten()
+    return masked_mean(distance.square().flatten(), mask=real).sqrt()
+
+
 def leave_one_out(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None) -> Tensor:
     r"""Scores less the mean of the *others* of their group: RLOO's advantage.
 

@@ -14,6 +14,8 @@ from stacked import check_runs, runs_of, train_stack
 from tasks import Metrics, make_task
 from torch.nn.utils import clip_grad_norm_
 from utils import (
+    goes_on,
+    held,
     is_far,
     is_single,
     make_collector,
@@ -50,7 +52,9 @@ def main(config: DictConfig) -> None:
     run = make_run(config, task)
 
     groups_of_trajectories = iter(collector)
-    progress = Progress(trajectories=0, project_steps=0, is_annealing=config.anneal_from is None)
+    progress = Progress(
+        trajectories=0, project_steps=0, is_annealing=config.anneal_from is None, held=0
+    )
     with (
         shut_down(collector),
         run,
@@ -64,7 +68,7 @@ def main(config: DictConfig) -> None:
             evaluation_env=task.evaluation_env,
         ),
     ):
-        while progress.trajectories < config.total_trajectories:
+        while progress.trajectories < config.total_trajectories and goes_on(config, progress.held):
             # Lift: the current policy becomes the reference.
             collector.update_policy_weights_()
             lifted_at = progress.trajectories
@@ -90,6 +94,7 @@ def main(config: DictConfig) -> None:
                 if progress.project_steps % config.evaluation_interval == 0:
                     metrics |= task.evaluate(groups)
                 run.log(metrics, step=progress.trajectories)
+                progress.held = held(config.stop_when, progress.held, metrics)
             progress.is_annealing |= reached(config.anneal_from, metrics)
             temperatures.step(progress.is_annealing * (progress.trajectories - lifted_at))
             checkpoints.boundary()

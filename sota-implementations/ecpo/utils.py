@@ -143,10 +143,22 @@ def reached(goal: DictConfig | None, metrics: Metrics) -> bool:
         return True
     if goal.metric not in metrics:
         raise KeyError(
-            f"anneal_from.metric must be one of {sorted(metrics)}, which every gradient step has, "
-            f"got {goal.metric!r}."
+            f"anneal_from.metric and stop_when.metric must be one of {sorted(metrics)}, which "
+            f"every batch has, got {goal.metric!r}."
         )
     return bool(metrics[goal.metric] >= goal.at_least)
+
+
+def held(goal: DictConfig | None, so_far: int, metrics: Metrics) -> int:
+    """For how many batches in a row a metric has been up to a goal; once enough, always."""
+    if goal is None or so_far >= goal.batches:
+        return so_far
+    return so_far + 1 if reached(goal, metrics) else 0
+
+
+def goes_on(config: DictConfig, so_far: int) -> bool:
+    """Whether there is still something to wait for."""
+    return config.stop_when is None or so_far < config.stop_when.batches
 
 
 def run_name(loss: str, seed: int, seeds: Any, stack: Any) -> str:

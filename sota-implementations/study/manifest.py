@@ -29,7 +29,7 @@ RANKS = ("area", "final")
 # Runs that differ in these alone have the same numbers, as far as both go: the entries of env are
 # those that other entries are or were read from, the last is how Q networks are called.
 NOT_THE_RUN = (
-    *("resume", "checkpoint", "logger", "threads", "compile", "stack"),
+    *("resume", "checkpoint", "logger", "threads", "compile", "stack", "stop_when"),
     *("env.settings", "env.optim", "env.cracked", "env.num_groups", "env.evaluation_interval"),
     "loss.options.deactivate_vmap",
 )
@@ -41,6 +41,7 @@ IMPLIED = {
     "env.distinct_histories": True,  # as TorchRL's LSTMModule has it; the same numbers, slower
     "env.hidden_size": 128,  # of the LSTM, which was the only policy
     "loss.score": "return",
+    "loss.surprise": "nats",
     "policy.name": "lstm",
     "policy.window": "None",
     "policy.hidden_size": 128,

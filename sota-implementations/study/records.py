@@ -67,9 +67,16 @@ class Record:
         return _read_json(self.path / "versions.json")
 
     @property
+    def stopped_at(self) -> int | None:
+        """The step at which it stopped early, having reached what ``stop_when`` asks for."""
+        is_early = bool(self.summary.get("finished")) and self.summary[self.unit] < self.total
+        return self.summary[self.unit] if is_early and self.config.get("stop_when") else None
+
+    @property
     def finished(self) -> bool:
         """Whether it has made all its steps; a summary may be that of a shorter run before it."""
-        return bool(self.summary.get("finished")) and self.summary[self.unit] >= self.total
+        is_whole = bool(self.summary.get("finished")) and self.summary[self.unit] >= self.total
+        return is_whole or self.stopped_at is not None
 
     @cached_property
     def metrics(self) -> dict[str, list[float]]:
@@ -78,7 +85,9 @@ class Record:
 
     @property
     def reached(self) -> int:
-        """How many steps it has made, as far as they are recorded."""
+        """How many steps it has made, as far as they are recorded; all, if it stopped early."""
+        if self.stopped_at is not None:
+            return self.total
         if self.finished:
             return self.summary[self.unit]
         return int(self.metrics["step"][-1]) if self.metrics else 0

@@ -81,6 +81,8 @@ class Results:
             return False
         self.configs[cell.name] = config
         self.curves[key] = thin(record.metrics, metrics, cell.steps)
+        if record.stopped_at is not None:
+            self.curves[key] = extended(self.curves[key], cell.steps)
         values = {
             **dict(zip(KEYS, key, strict=True)),
             "options": " ".join(cell.options),
@@ -88,6 +90,7 @@ class Results:
             "reached": record.reached,
             "unit": record.unit,
             "finished": record.finished,
+            "stopped_at": record.stopped_at or "",
             "seconds": "" if record.seconds is None else record.seconds,
             **record.versions,
         }
@@ -142,6 +145,18 @@ def thin(columns: Mapping[str, Sequence[float]], metrics: Sequence[str], steps: 
         if len(point) > 1:
             points.append(point)
     return points
+
+
+def extended(points: Sequence[Point], steps: int) -> list[Point]:
+    """The curve of a run that stopped early, with what it held until the end.
+
+    Examples:
+        >>> extended([{"step": 198, "return": 5.0}], steps=200)
+        [{'step': 198, 'return': 5.0}, {'step': 200, 'return': 5.0}]
+    """
+    last = {name: next(p[name] for p in reversed(points) if name in p) for name in points[-1]}
+    ends = [round(part * steps / POINTS) for part in range(1, POINTS + 1)]
+    return [*points, *({**last, "step": end} for end in ends if end > last["step"])]
 
 
 def _but_for_the_seed(identity: Mapping[str, float | str]) -> dict[str, float | str]:

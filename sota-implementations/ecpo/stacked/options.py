@@ -17,7 +17,7 @@ FOLDER = Path(__file__).parents[1]
 KINDS = ("algorithmic", "bandit")
 MAY_DIFFER = (
     *("seed", "loss", "optim", "project_steps", "epochs", "max_kl"),
-    *("anneal_from", "evaluation_interval", "env.curriculum", "env.instance_seed"),
+    *("anneal_from", "stop_when", "evaluation_interval", "env.curriculum", "env.instance_seed"),
 )
 
 

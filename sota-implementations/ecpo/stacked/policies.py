@@ -48,7 +48,7 @@ class StackedPolicy(TensorDictModuleBase):
 
     @abstractmethod
     def log_prob(self, steps: TensorDictBase) -> Callable[[], Tensor]:
-        """What gives the log-probability ``[N, T]`` of trajectories, with the weights of the day."""
+        """What gives the log-probability ``[N, T]`` of trajectories, by the weights of then."""
 
     def copy_run(self, run: int, other: StackedPolicy) -> None:
         """Take over the weights that another stack has for a run."""

@@ -17,6 +17,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 from utils import (
+    goes_on,
+    held,
     is_far,
     make_loss,
     make_optimizer,
@@ -47,7 +49,7 @@ def train_stack(configs: Mapping[str, DictConfig], checkpoints: Checkpoints) -> 
             open_runs.enter_context(member.run)
         run, *_ = (member.run for member in stack.members)
         open_runs.enter_context(checkpoints.attach(run, stack.progress, **stack.parts()))
-        while stack.progress.trajectories < total:
+        while stack.progress.trajectories < total and stack.goes_on:
             stack.lift()
             stack.project()
             stack.anneal()
@@ -100,7 +102,15 @@ class Stack:
             for index, ((name, config), task) in enumerate(zip(configs.items(), tasks, strict=True))
         ]
         is_annealing = [config.anneal_from is None for config in configs.values()]
-        self.progress = Progress(trajectories=0, project_steps=0, is_annealing=is_annealing)
+        self.progress = Progress(
+            trajectories=0, project_steps=0, is_annealing=is_annealing, held=[0] * len(tasks)
+        )
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether there is still something to wait for in one of the runs."""
+        pairs = zip(self.members, self.progress.held, strict=True)
+        return any(goes_on(member.config, so_far) for member, so_far in pairs)
 
     def parts(self) -> dict[str, Any]:
         """What a checkpoint holds beside the first run's record and the progress."""
@@ -162,6 +172,8 @@ class Stack:
                     metrics |= member.task.evaluate(part)
             member.metrics = metrics
             member.run.log(metrics, step=self.progress.trajectories)
+            so_far = self.progress.held[index]
+            self.progress.held[index] = held(member.config.stop_when, so_far, metrics)
 
     def anneal(self) -> None:
         """Where a run's projection ends, its temperatures may fall."""
