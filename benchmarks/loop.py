@@ -135,15 +135,15 @@ class DistinctNet:
     def step(self, symbol: Tensor, state: State | None) -> tuple[Tensor, State]:
         """Logits and state `[n, *]` of one step; without a state, the first."""
         starts = torch.full((1, len(symbol)), state is None)
-        nodes, *values = self.core.evaluate(symbol.unsqueeze(0), starts, states=state)
-        logits, h, c = (value.index_select(0, nodes[0]) for value in values)
-        return logits, (h, c)
+        nodes, logits, states = self.core.evaluate(symbol.unsqueeze(0), starts, states=state)
+        h, c = (value.squeeze(1).index_select(0, nodes[0]) for value in states.values())
+        return logits.index_select(0, nodes[0]), (h, c)
 
     def unroll(self, steps: Steps) -> Tensor:
         """Logits `[T, N, L]` of whole trajectories."""
         starts = ~steps.mask
         starts[0] = True
-        nodes, logits, *_ = self.core.evaluate(steps.symbol, starts, steps.mask)
+        nodes, logits, _ = self.core.evaluate(steps.symbol, starts, steps.mask)
         return logits.index_select(0, nodes.flatten()).view(*nodes.shape, -1)
 
 
@@ -263,7 +263,7 @@ def take_turns(loops: list[Iteration], repeats: int) -> tuple[list[float], ...]:
 TIMED: dict[str, list[tuple[Any, str]]] = {
     "collecting": [(GroupPlayer, "play"), (sys.modules[__name__], "collect")],
     "policy": [(GroupPlayer, "_act")],
-    "LSTM": [(DistinctHistoryLSTM, "_run")],
+    "LSTM": [(DistinctHistoryLSTM, "evaluate")],
     "distribution": [
         (TupleCategorical, name) for name in ("sample", "log_prob", "sample_and_log_prob")
     ],

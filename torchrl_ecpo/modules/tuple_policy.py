@@ -57,7 +57,8 @@ class TupleCategorical(Distribution):
 
     Raises:
         ValueError: if nvec is not of the form (moves, 2, characters), L is another size, or a logit
-            is NaN or infinity (-infinity: what is never taken).
+            is NaN or infinity (-infinity: what is never taken), or if rows are not among those of
+            the logits.
 
     Examples:
         >>> import torch
@@ -91,6 +92,18 @@ class TupleCategorical(Distribution):
             raise ValueError(
                 "logits: expected numbers, got NaN or infinity; the network's weights may be NaN."
             )
+        if rows is not None:
+            check_kind("rows", rows, Tensor)
+            if rows.dtype != torch.int64 or logits.ndim != 2:
+                raise ValueError(
+                    "rows: expected int64, and logits [n, L], got "
+                    f"{described(rows)} and {described(logits)}."
+                )
+            if validate_args and ((rows < 0) | (rows >= len(logits))).any():
+                raise ValueError(
+                    f"rows: expected numbers in [0, {len(logits)}), one for each row of logits, "
+                    f"got values from {rows.min()} to {rows.max()}."
+                )
         self.nvec, self._table, self._rows = tuple(nvec), logits, rows
         batch_shape = logits.shape[:-1] if rows is None else rows.shape
         # The base class would check the same constraint, at several times the cost.

@@ -11,7 +11,7 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 from torchrl.data import TensorSpec, Unbounded
 
-from torchrl_ecpo.checks import check_count
+from torchrl_ecpo.checks import check_count, described
 from torchrl_ecpo.modules.distinct import DistinctCore, Evaluated, as_readout
 
 __all__ = ["DistinctWindowNetwork"]
@@ -147,6 +147,8 @@ class DistinctWindowNetwork(DistinctCore):
 
         Of a single step it continues the past `[N, 1]`.
         """
+        if past is not None and past.dtype != torch.int64:
+            raise ValueError(f"window: expected int64 [*B, 1], got {described(past)}.")
         digits = symbols + 1
         first = torch.zeros_like(digits[:1]) if past is None else past.t()
         windows = digits
