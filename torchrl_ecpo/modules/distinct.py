@@ -221,7 +221,7 @@ class DistinctCore(TensorDictModuleBase):
         present = [state for state in states if state is not None]
         if present and len(present) == len(states):
             return [state.reshape(-1, state.shape[-1]) for state in present]
-        if starts.all():
+        if not states or starts.all():
             return None
         raise KeyError(
             f"{self.state_keys}: expected the states of rows that continue a trajectory, found "

@@ -120,7 +120,7 @@ class TupleCategorical(Distribution):
         other: Any = copy(self)
         other.__dict__.pop("logits", None)
         other._rows, other._batch_shape = rows, rows.shape
-        other._log_probs, other._bounds = self._log_probs, self._bounds
+        other._joint, other._bounds = self._joint, self._bounds
         return other
 
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
@@ -193,11 +193,10 @@ class TupleCategorical(Distribution):
 
     def _score(self, value: Tensor) -> Tensor:
         """Log-probability of actions within range."""
-        log_probs, rows = self._log_probs, self._rows
-        shape = value.shape[:-1]
+        shape, rows = value.shape[:-1], self._rows
         if shape != self.batch_shape:
             try:
-                shape = torch.broadcast_shapes(shape, self.batch_shape)
+                torch.broadcast_shapes(shape, self.batch_shape)
             except RuntimeError:
                 raise ValueError(
                     f"action: expected the batch shape {tuple(self.batch_shape)} of the logits, "
@@ -206,11 +205,12 @@ class TupleCategorical(Distribution):
         if rows is None:
             rows = torch.arange(self.batch_shape.numel(), device=value.device)
             rows = rows.view(self.batch_shape)
-        factors, width = log_probs.shape[-2:]
-        first = rows.unsqueeze(-1) * factors + torch.arange(factors, device=value.device)
-        index = (first * width + value).expand(*shape, -1)
-        move, write, character = take_rows(log_probs.flatten(), index).unbind(-1)
-        return move + write + character.where(value[..., 1] == 1, 0)
+        move, write, character = value.unbind(-1)
+        moves, _, characters = self.nvec
+        what = torch.addcmul(write, write, character)  # 0: nothing
+        index = torch.add(what, move, alpha=1 + characters)
+        index = torch.add(index, rows, alpha=moves * (1 + characters))
+        return take_rows(self._joint.flatten(), index)
 
     def entropy(self) -> Tensor:
         """Exact entropy of the tuple, in nats, `[*B]`."""
@@ -233,6 +233,15 @@ class TupleCategorical(Distribution):
         factors = torch.stack(padded, -2)
         # On few classes log_softmax takes two to four times as long.
         return (factors - factors.logsumexp(-1, keepdim=True)).clamp(min=floor)
+
+    @lazy_property
+    def _joint(self) -> Tensor:
+        """Log-probability of each move with each thing to write, nothing first: `[*, m, 1 + c]`."""
+        parts = self._log_probs.unbind(-2)
+        move, write, character = (part[..., :n] for part, n in zip(parts, self.nvec, strict=True))
+        joint = move.unsqueeze(-1) + write.unsqueeze(-2)
+        written = joint[..., 1:] + character.unsqueeze(-2)
+        return torch.cat([joint[..., :1], written], -1)
 
     @lazy_property
     def _bounds(self) -> Tensor:
