@@ -14,6 +14,7 @@ processor time in milliseconds, which other processes disturb least.
   package's, called on plain tensors by a loop written for this one case: no TensorDict, no
   environment class, no keys, no checks, no diagnostics.
 - plain: the bare loop with PyTorch's `LSTMCell` and `LSTM` on every row.
+- window 1, window 4: the loop "ecpo" with a policy that sees the last steps, in place of the LSTM.
 
 `--profile` tells instead what a step of collecting is made of, in microseconds.
 
@@ -52,6 +53,7 @@ GROUP_SIZE, PROJECT_STEPS = 10, 5
 NUM_OBSERVATIONS, NVEC = 3, (2, 2, 2)  # of Reverse
 NUM_CLASSES = (NUM_OBSERVATIONS, *(n + 1 for n in NVEC))
 TAU, TAU_PRIME, MAX_GRAD_NORM, LEARNING_RATE = 0.5, 0.01, 50.0, 1e-9
+WINDOWS = (1, 4)  # steps that policies without LSTM see
 STRAY, WRITE = 0.02, 0.002  # probabilities of a move to the left and of writing
 
 Iteration = Callable[[], int]
@@ -69,17 +71,19 @@ def make_env(level: int, num_groups: int) -> AlgorithmicEnv:
     )
 
 
-def make_actor(stray: float = STRAY, write: float = WRITE) -> ProbabilisticActor:
+def make_actor(
+    stray: float = STRAY, write: float = WRITE, window: int | None = None
+) -> ProbabilisticActor:
     """A policy whose trajectories last."""
     torch.manual_seed(0)
-    actor = make_tuple_policy(NUM_OBSERVATIONS, NVEC)
+    actor = make_tuple_policy(NUM_OBSERVATIONS, NVEC, window=window)
     bias_to_last(actor, stray, write)
     return actor
 
 
 def bias_to_last(actor: nn.Module, stray: float = STRAY, write: float = WRITE) -> None:
     """Let a policy move left with probability `stray` and write with probability `write`."""
-    readout = next(module for module in actor.modules() if isinstance(module, nn.Linear))
+    *_, readout = (module for module in actor.modules() if isinstance(module, nn.Linear))
     bias = torch.tensor([stray, 1 - stray, 1 - write, write, 0.5, 0.5]).log()
     with torch.no_grad():
         readout.bias.copy_(bias.expand_as(readout.bias))
@@ -135,15 +139,15 @@ class DistinctNet:
     def step(self, symbol: Tensor, state: State | None) -> tuple[Tensor, State]:
         """Logits and state `[n, *]` of one step; without a state, the first."""
         starts = torch.full((1, len(symbol)), state is None)
-        nodes, *values = self.core.evaluate(symbol.unsqueeze(0), starts, states=state)
-        logits, h, c = (value.index_select(0, nodes[0]) for value in values)
-        return logits, (h, c)
+        nodes, logits, states = self.core.evaluate(symbol.unsqueeze(0), starts, states=state)
+        h, c = (value.squeeze(1).index_select(0, nodes[0]) for value in states.values())
+        return logits.index_select(0, nodes[0]), (h, c)
 
     def unroll(self, steps: Steps) -> Tensor:
         """Logits `[T, N, L]` of whole trajectories."""
         starts = ~steps.mask
         starts[0] = True
-        nodes, logits, *_ = self.core.evaluate(steps.symbol, starts, steps.mask)
+        nodes, logits, _ = self.core.evaluate(steps.symbol, starts, steps.mask)
         return logits.index_select(0, nodes.flatten()).view(*nodes.shape, -1)
 
 
@@ -263,7 +267,7 @@ def take_turns(loops: list[Iteration], repeats: int) -> tuple[list[float], ...]:
 TIMED: dict[str, list[tuple[Any, str]]] = {
     "collecting": [(GroupPlayer, "play"), (sys.modules[__name__], "collect")],
     "policy": [(GroupPlayer, "_act")],
-    "LSTM": [(DistinctHistoryLSTM, "_run")],
+    "LSTM": [(DistinctHistoryLSTM, "evaluate")],
     "distribution": [
         (TupleCategorical, name) for name in ("sample", "log_prob", "sample_and_log_prob")
     ],
@@ -365,27 +369,32 @@ def main() -> None:
     if arguments.profile:
         print_profile(arguments)
         return
+    names = ["ecpo", "bare", "plain", *(f"window {window}" for window in WINDOWS)]
+    over = ["bare/ecpo", "plain/ecpo", *(f"ecpo/{name}" for name in names[3:])]
     print("ms an iteration: processor (wall clock); ratios of processor time")
-    print("level  steps |      ecpo     |      bare     |     plain     | bare/ecpo  plain/ecpo")
+    print("level  steps |", " | ".join([*(f"{name:^13}" for name in names), "  ".join(over)]))
     table = []
     for level in arguments.levels:
-        actors = [make_actor(arguments.stray, arguments.write) for _ in range(3)]
+        windows = (None, None, None, *WINDOWS)
+        actors = [make_actor(arguments.stray, arguments.write, window) for window in windows]
         loops = [
             ecpo_loop(level, arguments.groups, actors[0]),
             bare_loop(level, arguments.groups, actors[1], DistinctNet),
             bare_loop(level, arguments.groups, actors[2], PlainNet),
+            *(ecpo_loop(level, arguments.groups, actor) for actor in actors[3:]),
         ]
         processor, wall, steps = take_turns(loops, arguments.repeats)
         cells = [f"{level:5d} {steps[0]:6.0f}"]
         cells += [f"{x:5.0f} ({y:5.0f})" for x, y in zip(processor, wall, strict=True)]
-        ecpo, bare, plain = processor
-        cells.append(f"{bare / ecpo:9.2f}  {plain / ecpo:10.2f}")
+        times = dict(zip(names, processor, strict=True))
+        ratios = {name: times[(pair := name.split("/"))[0]] / times[pair[1]] for name in over}
+        cells.append("  ".join(f"{ratio:{len(name)}.2f}" for name, ratio in ratios.items()))
         print(" | ".join(cells), flush=True)
         row = {"level": level, "groups": arguments.groups, "stray": arguments.stray}
         row |= {"steps": round(steps[0])}
-        for name, x, y in zip(("ecpo", "bare", "plain"), processor, wall, strict=True):
+        for name, x, y in zip(names, processor, wall, strict=True):
             row |= {f"{name}_ms": x, f"{name}_wall_ms": y}
-        table.append(row | {"bare_over_ecpo": bare / ecpo, "plain_over_ecpo": plain / ecpo})
+        table.append(row | {name.replace("/", "_over_"): ratio for name, ratio in ratios.items()})
     write_csv(arguments.csv, table)
 
 

@@ -15,6 +15,7 @@ from torchrl.modules import set_recurrent_mode
 from torchrl_ecpo.modules import (
     DenseNetwork,
     DistinctHistoryLSTM,
+    DistinctWindowNetwork,
     LinearSoftmax,
     SharedCategorical,
     TupleCategorical,
@@ -118,6 +119,7 @@ STEP = {
     "is_init": torch.tensor([[True], [False], [False], [False]]),
 }
 STATE = {f"recurrent_state_{x}": torch.linspace(-1, 1, 32).reshape(4, 1, 8) for x in "hc"}
+WINDOW = {"window": torch.tensor([[0], [1], [324], [7]])}
 SEQUENCES = {
     "observation": torch.tensor([[5, 1, 0], [3, 4, 0]]),
     "previous_action": torch.tensor([[[2, 2, 5], [1, 1, 4], [0, 0, 0]]]).repeat(2, 1, 1),
@@ -135,11 +137,18 @@ SHAPES = {
 }
 OTHERS = {("features", name): "other features" for name in [*LENGTHS, "transposed"]}
 CLASSES = {(name, "flags"): "classes 0 and 1" for name in ("observation", "previous_action")}
+MORE_ROWS = "there may be more than are used"
 NAMES = {("out_key", name): "a name" for name in ("'embedx'", "'EMBED'", "''")}
 
 
 def make_lstm():
     return DistinctHistoryLSTM((6, 3, 3, 6), 8, in_keys=["observation", "previous_action"])
+
+
+def make_window():
+    return DistinctWindowNetwork(
+        (6, 3, 3, 6), 8, window=2, in_keys=["observation", "previous_action"]
+    )
 
 
 def make_tuples():
@@ -210,10 +219,28 @@ SUBJECTS = {
         fine={("logits", "an axis less"): ALIKE, ("logits", "-inf"): "never taken"},
         optional=["action", "validate_args"],
     ),
+    "TupleCategorical, rows": Subject(
+        tuples,
+        {
+            "logits": LOGITS,
+            "nvec": NVEC,
+            "rows": torch.tensor([3, 0, 0, 1]),
+            "action": TUPLES,
+            "validate_args": True,
+        },
+        lone=["rows"],
+        fine={("logits", "too long in axis 0"): MORE_ROWS, ("logits", "-inf"): "never taken"},
+        optional=["rows", "action", "validate_args"],
+    ),
     "make_tuple_policy": Subject(
         build(make_tuple_policy, **STEP, **STATE),
         {"num_observations": 6, "nvec": NVEC, "hidden_size": 8, "distinct_histories": True},
         optional=["hidden_size", "distinct_histories"],
+    ),
+    "make_tuple_policy, window": Subject(
+        build(make_tuple_policy, **STEP, **STATE, **WINDOW),
+        {"num_observations": 6, "nvec": NVEC, "hidden_size": 8, "window": 2},
+        optional=["hidden_size", "window"],
     ),
     "make_tuple_policy()(step)": Subject(read(make_tuples, (4,), STATE), STEP, fine=CLASSES),
     "make_tuple_policy()(sequences)": Subject(
@@ -237,6 +264,20 @@ SUBJECTS = {
     "DistinctHistoryLSTM.forward": Subject(
         read(make_lstm, (4,)), STEP | STATE, fine=CLASSES, hands_on_nan=True
     ),
+    "DistinctWindowNetwork": Subject(
+        build(DistinctWindowNetwork, **STEP, **WINDOW),
+        {
+            "num_classes": (6, 3, 3, 6),
+            "hidden_size": 8,
+            "window": 2,
+            "readout": torch.nn.Identity(),
+            "in_keys": ["observation", "previous_action"],
+            "out_key": "embed",
+        },
+        fine=NAMES,
+        optional=["hidden_size", "window", "readout", "out_key"],
+    ),
+    "DistinctWindowNetwork.forward": Subject(read(make_window, (4,)), STEP | WINDOW, fine=CLASSES),
     "record_latents": Subject(latents, {"policy": SPEC}),
 }
 

@@ -85,6 +85,71 @@ def test_what_is_improbable_is_rare_in_half_precision(dtype: torch.dtype) -> Non
     assert (moves == 0).all()  # the others: 2e-9 each
 
 
+def in_rows(*shape: int) -> tuple[TupleCategorical, TupleCategorical]:
+    """The distribution of rows of a table of logits, and the one of the gathered logits."""
+    table = random_dist(5).logits
+    rows = torch.randint(5, shape, generator=torch.Generator().manual_seed(1))
+    return TupleCategorical(table, NVEC, rows=rows), TupleCategorical(table[rows], NVEC)
+
+
+def assert_same(ours: TupleCategorical, plain: TupleCategorical) -> None:
+    def of(dist: TupleCategorical) -> list[Any]:
+        torch.manual_seed(0)
+        samples = [dist.sample(), dist.sample((2, 3)), *dist.sample_and_log_prob()]
+        every = ACTIONS.view(-1, *[1] * len(dist.batch_shape), 3)
+        actions = [every, every.expand(-1, *dist.batch_shape, -1), ACTIONS[4], samples[0]]
+        log_probs = [dist.log_prob(action) for action in actions]
+        return [dist.batch_shape, dist.logits, dist.mode, dist.entropy(), *samples, *log_probs]
+
+    assert_close(of(ours), of(plain), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("shape", [(12,), (3, 4), (), (0,)])
+def test_rows_of_logits_are_as_good_as_gathered_logits(shape: tuple[int, ...]) -> None:
+    ours, plain = in_rows(*shape)
+    assert_same(ours, plain)
+    other = torch.tensor([[0, 4], [4, 2]])
+    assert ours.logits.shape[:-1] == shape
+    assert_same(ours.at(other), TupleCategorical(random_dist(5).logits[other], NVEC))
+    assert_same(ours, plain)  # still
+
+
+def test_rows_of_logits_gradients() -> None:
+    gradients = []
+    rows = torch.tensor([[0, 2, 2], [4, 0, 2]])  # 1 and 3 do not occur
+    for gathered in (False, True):
+        table = random_dist(5).logits.requires_grad_()
+        kwargs: dict[str, Any] = {} if gathered else {"rows": rows}
+        dist = TupleCategorical(table[rows] if gathered else table, NVEC, **kwargs)
+        objective = dist.log_prob(ACTIONS.view(-1, 1, 1, 3)).sin().sum() + dist.entropy().sum()
+        gradients.append(torch.autograd.grad(objective, table)[0])
+    assert_close(*gradients)
+    assert (gradients[0][[1, 3]] == 0).all()
+
+
+@pytest.mark.parametrize("dtype", [*DTYPES, torch.float16])
+def test_what_is_impossible_is_never_drawn(dtype: torch.dtype) -> None:
+    generator = torch.Generator().manual_seed(0)
+    logits = 3 * torch.randn(400, sum(NVEC), generator=generator).to(dtype)
+    impossible = torch.rand(logits.shape, generator=generator) < 0.6
+    impossible[:, [1, 3, 6]] = False  # one of each factor remains
+    dist = TupleCategorical(logits.masked_fill(impossible, -torch.inf), NVEC)
+    double = dtype == torch.float64
+    uniform = torch.promote_types(dtype, torch.float32)
+    # Also where one number of the distribution function is met exactly.
+    points = [0.0, 1 - 2 ** -(53 if double else 24), 0.5]
+    extremes = torch.tensor(points, dtype=uniform).view(-1, 1, 1).expand(-1, 400, 3)
+    bounds = dist._bounds.movedim(-1, 0)
+    choice = dist.choose(
+        torch.cat([extremes, bounds[bounds.amax((1, 2)) < 1], bounds.nextafter(-bounds)])
+    )
+    assert ((choice >= 0) & (choice < torch.tensor(NVEC))).all()
+    is_possible = [~part for part in impossible.split(NVEC, -1)]
+    for factor, possible in enumerate(is_possible):
+        taken = possible.expand(len(choice), -1, -1).gather(-1, choice[..., factor, None])[..., 0]
+        assert taken[choice[..., 1] == 1].all() if factor == 2 else taken.all()
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_extreme_logits(dtype: torch.dtype) -> None:
     size, largest = sum(NVEC), torch.finfo(dtype).max

@@ -178,7 +178,7 @@ class GroupPlayer:
             for _ in range(self.num_groups * self.group_size // self.env.batch_size.numel()):
                 groups.append(self._play_round(steps, sum(map(len, groups))))
         assert self._flow is not None
-        batch = _pad(steps, self._flow, sum(map(len, groups)))
+        batch = _pad(steps, self._flow, sum(map(len, groups)), self.env.ndim)
         mask = batch[MASK_KEY]
         ids = torch.arange(self._next_id, self._next_id + len(mask), device=mask.device)
         self._next_id += len(mask)
@@ -198,10 +198,11 @@ class GroupPlayer:
             acted = self._act(seen, rows)
             step = self.env.step(self._set_inputs(root, acted, places))
             flow = self._flow = self._flow or self._trace_flow(step, acted)
-            kept = [step.get(key).flatten(0, step.ndim - 1) for key in flow.kept]
+            entries = dict(step.items(True, True))  # quicker than one by one
+            kept = [entries[key] for key in flow.kept]
             decided = [acted.get(key).flatten(0, acted.ndim - 1) for key in flow.decided]
             steps.append(_Step(first, time, rows, kept, decided))
-            done = step.get(("next", "done")).reshape(-1).index_select(0, rows)
+            done = entries["next", "done"].reshape(-1).index_select(0, rows)
             going_on = done.logical_not_().nonzero().squeeze(-1)
             if not len(going_on):
                 return group
@@ -307,7 +308,7 @@ class _Step(NamedTuple):
     rows: Tensor
     """Those that had not ended, `[n]`."""
     kept: list[Tensor]
-    """`[N, *]` each."""
+    """`[*B, K, *]` each."""
     decided: list[Tensor]
     """`[n, *]` each."""
 
@@ -399,7 +400,7 @@ def _show(
     return TensorDict(seen, batch_size=rows.shape, device=root.device)
 
 
-def _pad(steps: list[_Step], flow: _Flow, num_trajectories: int) -> TensorDictBase:
+def _pad(steps: list[_Step], flow: _Flow, num_trajectories: int, ndim: int) -> TensorDictBase:
     """Lay out trajectories as `[G * K, T]`, with their mask and zeros after their ends."""
     shape = torch.Size([num_trajectories, max(step.time for step in steps) + 1])
     place = torch.cat([(step.first + step.rows) * shape[1] + step.time for step in steps])
@@ -413,7 +414,7 @@ def _pad(steps: list[_Step], flow: _Flow, num_trajectories: int) -> TensorDictBa
     num_rows = len(steps[0].rows)
     source = torch.cat([step.rows + i * num_rows for i, step in enumerate(steps)])
     for key, *values in zip(flow.kept, *(step.kept for step in steps), strict=True):
-        write(key, torch.cat(values).index_select(0, source))
+        write(key, torch.cat(values).flatten(0, ndim - 1).index_select(0, source))
     for key, *values in zip(flow.decided, *(step.decided for step in steps), strict=True):
         write(key, torch.cat(values))
     return batch

@@ -64,9 +64,9 @@ class DistinctCore(TensorDictModuleBase):
         super().__init__()
         self.num_classes = check_counts("num_classes", num_classes)
         self.num_symbols = prod(self.num_classes)
-        if self.num_symbols > 2**31:
+        if not self.num_classes or self.num_symbols > 2**31:
             raise ValueError(
-                "num_classes: expected numbers with a product of at most 2^31, got "
+                "num_classes: expected one or more numbers, with a product of at most 2^31, got "
                 f"{self.num_classes}."
             )
         self.input_keys = check_keys("in_keys", in_keys)
@@ -215,7 +215,7 @@ class DistinctCore(TensorDictModuleBase):
         present = [state for state in states if state is not None]
         if present and len(present) == len(states):
             return [state.reshape(-1, state.shape[-1]) for state in present]
-        if starts.all():
+        if not states or starts.all():
             return None
         raise KeyError(
             f"{self.state_keys}: expected the states of rows that continue a trajectory, found "
@@ -268,4 +268,4 @@ def as_readout(readout: nn.Module | None) -> nn.Module:
 def take_rows(values: Tensor, index: Tensor) -> Tensor:
     """`values[index]` along the first dimension, `[*index.shape, *]`."""
     # Quicker than indexing, above all backwards.
-    return values.index_select(0, index.reshape(-1)).unflatten(0, index.shape)
+    return values.index_select(0, index.reshape(-1)).view(index.shape + values.shape[1:])

@@ -57,7 +57,8 @@ class TupleCategorical(Distribution):
 
     Raises:
         ValueError: if nvec is not of the form (moves, 2, characters), L is another size, or a logit
-            is NaN or infinity (-infinity: what is never taken).
+            is NaN or infinity (-infinity: what is never taken), or if rows are not among those of
+            the logits.
 
     Examples:
         >>> import torch
@@ -91,6 +92,18 @@ class TupleCategorical(Distribution):
             raise ValueError(
                 "logits: expected numbers, got NaN or infinity; the network's weights may be NaN."
             )
+        if rows is not None:
+            check_kind("rows", rows, Tensor)
+            if rows.dtype != torch.int64 or logits.ndim != 2:
+                raise ValueError(
+                    "rows: expected int64, and logits [n, L], got "
+                    f"{described(rows)} and {described(logits)}."
+                )
+            if validate_args and ((rows < 0) | (rows >= len(logits))).any():
+                raise ValueError(
+                    f"rows: expected numbers in [0, {len(logits)}), one for each row of logits, "
+                    f"got values from {rows.min()} to {rows.max()}."
+                )
         self.nvec, self._table, self._rows = tuple(nvec), logits, rows
         batch_shape = logits.shape[:-1] if rows is None else rows.shape
         # The base class would check the same constraint, at several times the cost.
@@ -107,7 +120,7 @@ class TupleCategorical(Distribution):
         other: Any = copy(self)
         other.__dict__.pop("logits", None)
         other._rows, other._batch_shape = rows, rows.shape
-        other._log_probs, other._bounds = self._log_probs, self._bounds
+        other._joint, other._bounds = self._joint, self._bounds
         return other
 
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
@@ -190,7 +203,7 @@ class TupleCategorical(Distribution):
         shape, rows = value.shape[:-1], self._rows
         if shape != self.batch_shape:
             try:
-                shape = torch.broadcast_shapes(shape, self.batch_shape)
+                torch.broadcast_shapes(shape, self.batch_shape)
             except RuntimeError:
                 raise ValueError(
                     f"action: expected the batch shape {tuple(self.batch_shape)} of the logits, "
@@ -199,17 +212,15 @@ class TupleCategorical(Distribution):
         if rows is None:
             rows = torch.arange(self.batch_shape.numel(), device=value.device)
             rows = rows.view(self.batch_shape)
-        factors, width = self._log_probs.shape[-2:]
-        first = rows.unsqueeze(-1) * factors + torch.arange(factors, device=value.device)
-        places = (first * width + value).expand(*shape, -1)
-        # A character that is not written counts 0, which is what the last place has.
-        is_idle = torch.zeros_like(value, dtype=torch.bool)
-        is_idle[..., 2] = value[..., 1] == 0
-        return places.masked_fill(is_idle, self._log_probs.numel())
+        move, write, character = value.unbind(-1)
+        moves, _, characters = self.nvec
+        what = torch.addcmul(write, write, character)  # 0: nothing
+        places = torch.add(what, move, alpha=1 + characters)
+        return torch.add(places, rows, alpha=moves * (1 + characters))
 
     def log_prob_at(self, places: Tensor) -> Tensor:
         """Log-probability of the actions whose :meth:`places` these are, `[...]`."""
-        return take_rows(F.pad(self._log_probs.flatten(), (0, 1)), places).sum(-1)
+        return take_rows(self._joint.flatten(), places)
 
     def entropy(self) -> Tensor:
         """Exact entropy of the tuple, in nats, `[*B]`."""
@@ -232,6 +243,15 @@ class TupleCategorical(Distribution):
         factors = torch.stack(padded, -2)
         # On few classes log_softmax takes two to four times as long.
         return (factors - factors.logsumexp(-1, keepdim=True)).clamp(min=floor)
+
+    @lazy_property
+    def _joint(self) -> Tensor:
+        """Log-probability of each move with each thing to write, nothing first: `[*, m, 1 + c]`."""
+        parts = self._log_probs.unbind(-2)
+        move, write, character = (part[..., :n] for part, n in zip(parts, self.nvec, strict=True))
+        joint = move.unsqueeze(-1) + write.unsqueeze(-2)
+        written = joint[..., 1:] + character.unsqueeze(-2)
+        return torch.cat([joint[..., :1], written], -1)
 
     @lazy_property
     def _bounds(self) -> Tensor:

@@ -9,9 +9,10 @@ from typing import Any
 import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
+from torch.nn import functional as F
 from torchrl.data import TensorSpec, Unbounded
 
-from torchrl_ecpo.checks import check_count
+from torchrl_ecpo.checks import check_count, described
 from torchrl_ecpo.modules.distinct import DistinctCore, Evaluated, as_readout
 
 __all__ = ["DistinctWindowNetwork"]
@@ -118,14 +119,13 @@ class DistinctWindowNetwork(DistinctCore):
         if mask is not None:
             windows = windows.masked_fill(~mask, 0)
         if self.is_tabular:
-            present = torch.arange(self.num_windows, device=windows.device)
-            nodes, output = windows, self._table
+            present, nodes = self._every(windows.device), windows
         else:
             present, nodes = windows.unique(return_inverse=True)
-            output = None
-        output = self.read_out(present) if output is None else output
-        past = (present % self.base ** (self.window - 1)).unsqueeze(1)
-        handed_on: Any = dict.fromkeys(self.state_keys, past)
+        output = self.read_out(present) if self._table is None else self._table
+        # To the next step goes all but the oldest symbol.
+        kept = self.base ** (self.window - 1)
+        handed_on: Any = {key: (present % kept).unsqueeze(1) for key in self.state_keys}
         return Evaluated(nodes, output, handed_on, present)
 
     @property
@@ -133,12 +133,14 @@ class DistinctWindowNetwork(DistinctCore):
         """Whether all windows are evaluated, which costs less than to find those that occur."""
         return self.base**self.window <= FEW
 
+    def _every(self, device: torch.device) -> Tensor:
+        return torch.arange(self.num_windows, device=device)
+
     @contextmanager
     def constant_weights(self) -> Iterator[Tensor | None]:
         """Within, the weights do not change: yields the output of all windows if it is kept."""
         if self.is_tabular:
-            device = next(self.parameters()).device
-            self._table = self.read_out(torch.arange(self.num_windows, device=device))
+            self._table = self.read_out(self._every(next(self.parameters()).device))
         try:
             yield self._table
         finally:
@@ -149,12 +151,12 @@ class DistinctWindowNetwork(DistinctCore):
 
         Of a single step it continues the past `[N, 1]`.
         """
-        digits = symbols + 1
-        first = torch.zeros_like(digits[:1]) if past is None else past.t()
-        windows = digits
+        if past is not None and past.dtype != torch.int64:
+            raise ValueError(f"window: expected int64 [*B, 1], got {described(past)}.")
+        digits = windows = symbols + 1
         for _ in range(min(self.window - 1, len(symbols))):
-            before = torch.cat([first, windows[:-1]]).masked_fill(starts, 0)
-            windows = digits + self.base * before
+            before = F.pad(windows[:-1], (0, 0, 1, 0)) if past is None else past.t()
+            windows = digits + self.base * before.masked_fill(starts, 0)
         return windows
 
     def read_out(self, windows: Tensor) -> Tensor:

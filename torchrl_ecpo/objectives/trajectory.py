@@ -42,6 +42,7 @@ from torchrl_ecpo.functional import (
     uniform_weights,
 )
 from torchrl_ecpo.groups import DONE_KEY, GROUP_KEY
+from torchrl_ecpo.modules.distinct import take_rows
 from torchrl_ecpo.modules.latents import (
     invert,
     is_lost,
@@ -403,7 +404,8 @@ class TrajectoryGroupLoss(PolicyLoss):
         inputs = inputs.reshape(-1, shape[-1])
         if step_mask is not None:
             step_mask = step_mask.reshape(-1, shape[-1])
-            inputs = inputs[_last_real_step(step_mask)]
+            last = _last_real_step(step_mask)
+            inputs = inputs.apply(lambda entry: take_rows(entry.flatten(0, 1), last))
             inputs.set(self.mask_keys[0], step_mask)
         return inputs
 
@@ -649,8 +651,8 @@ def _batch_shape(reward: Tensor, key: NestedKey) -> torch.Size:
     return reward.shape[:-1]
 
 
-def _last_real_step(step_mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Index ``[N, T]`` of the last real step at or before each step.
+def _last_real_step(step_mask: Tensor) -> Tensor:
+    """Index ``[N, T]``, counted over all steps, of the last real one at or before each step.
 
     Trajectories without a real step borrow those of the first trajectory that has one.
     """
@@ -659,7 +661,7 @@ def _last_real_step(step_mask: Tensor) -> tuple[Tensor, Tensor]:
     has_steps = step_mask.any(-1)
     rows = torch.arange(step_mask.shape[0], device=step_mask.device)
     rows = rows.where(has_steps, has_steps.int().argmax())
-    return rows.unsqueeze(-1).expand_as(columns), columns[rows]
+    return rows.unsqueeze(-1) * step_mask.shape[-1] + columns[rows]
 
 
 def _of_groups(groups: TrajectoryGroups) -> dict[str, Tensor]:
