@@ -542,8 +542,8 @@ class AlgorithmicEnv(EnvBase):
         tape = characters.new_full((count, _MAX_LENGTH + 2, task.rows + 2), task.base)
         tape[:, 1:-1, 1:-1] = characters.masked_fill(outside, task.base)
         time_limit = length + (target_length if task.rows == 1 else length) + 4
-        self._tape[rows] = tape.flatten(1)
-        self._target[rows] = nn.functional.pad(target, (0, 1), value=_PADDING)
+        self._tape.index_copy_(0, rows, tape.flatten(1))
+        self._target.index_copy_(0, rows, nn.functional.pad(target, (0, 1), value=_PADDING))
         self._cursor[rows] = self._cursor.new_tensor([1, 1, 0, 0])
         self._bound[rows] = torch.stack([target_length, time_limit + 1], -1)
         self._return[rows] = 0.0

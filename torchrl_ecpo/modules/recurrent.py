@@ -118,10 +118,11 @@ class DistinctHistoryLSTM(DistinctCore):
         last_symbols = symbols.flatten()[histories.rows]
         present, node_symbols = last_symbols.unique(return_inverse=True)
         lstm = LSTMOverHistories
-        past: Any = states or (None, None)
+        past_h, past_c = states or (None, None)
         h, c, _ = (lstm.apply if torch.is_grad_enabled() else lstm.forward)(
             self.project(present),
-            *past,
+            past_h,
+            past_c,
             node_symbols,
             histories,
             *self.recurrent_weights,

@@ -118,6 +118,8 @@ class DistinctWindowNetwork(DistinctCore):
         windows = self.find_windows(symbols, starts, None if states is None else states[0])
         if mask is not None:
             windows = windows.masked_fill(~mask, 0)
+        if self._table is not None and not self.state_keys:
+            return Evaluated(windows, self._table, {})
         if self.is_tabular:
             present, nodes = self._every(windows.device), windows
         else:
