@@ -1081,23 +1081,36 @@ def standardised_in_batch(
     return _in_deviations(distance.flatten(), mask=real).view_as(distance)
 
 
-def pooled_deviation(values: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None) -> Tensor:
-    r"""Standard deviation within groups, pooled over all of them.
+def matched_temperature(
+    tau_prime: Tensor, score: Tensor, log_prob: Tensor, *, mask: Tensor | None = None
+) -> Tensor:
+    r"""The tau' at which the entropy term of a lift spreads `tau_prime` times as far as the scores.
 
-    .. math:: \sqrt{\frac1{\sum_i K_i} \sum_i \sum_j (x_{ij} - \bar x_i)^2}
+    .. math:: \tau' \frac{\sqrt{\sigma_r^2 + 1/G}}{\max(\sigma_{\log\pi}, 1)}
+
+    with deviations within the G groups, pooled over them. That of the log-probabilities grows with
+    the trajectories' length, and falls with the entropy. 1/G: as if one more group had scores of
+    unit deviation, so that the entropy counts where all scores are equal.
+
+    Args:
+        tau_prime: 0-d.
+        score: ``[E*, K]``, of unit deviation within their group or in the batch.
+        log_prob: ``[E*, K]``, under the reference.
+        mask: ``[E*, K]``, False where there is no trajectory.
 
     Returns:
         0-d, detached.
 
     Examples:
-        The distances are 1, 1, 7 and 7:
+        Scores of deviation 1, surprise of deviation 2, a single group:
 
-        >>> pooled_deviation(torch.tensor([[0.0, 2.0], [0.0, 14.0]]))
-        tensor(5.)
+        >>> score, log_prob = torch.tensor([[-1.0, 1.0]]), torch.tensor([[-5.0, -1.0]])
+        >>> matched_temperature(torch.tensor(0.2), score, log_prob) * 2 / math.sqrt(2)
+        tensor(0.2000)
     """
-    distance = centred(values, sample_dim=sample_dim, mask=mask)
-    real = None if mask is None else mask.expand_as(distance).flatten()
-    return masked_mean(distance.square().flatten(), mask=real).sqrt()
+    of_score, of_log_prob = (_pooled_variance(x, mask) for x in (score, log_prob))
+    num_groups = score.shape[:-1].numel()
+    return tau_prime * ((of_score + 1 / num_groups) / of_log_prob.clamp_min(1)).sqrt()
 
 
 def leave_one_out(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = None) -> Tensor:
@@ -1156,6 +1169,13 @@ def log_mean_exp(values: Tensor, *, sample_dim: int = -1, mask: Tensor | None = 
     """
     _check_samples(sample_dim, mask, values=values)
     return _masked_logsumexp(values + _log_uniform(values, sample_dim, mask), sample_dim, mask)
+
+
+def _pooled_variance(values: Tensor, mask: Tensor | None) -> Tensor:
+    """Mean square distance from the own group's mean, 0-d."""
+    distance = centred(values, mask=mask)
+    real = None if mask is None else mask.expand_as(distance).flatten()
+    return masked_mean(distance.square().flatten(), mask=real)
 
 
 def _spread(score: Tensor, *, sample_dim: int, mask: Tensor | None) -> Tensor:

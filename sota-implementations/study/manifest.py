@@ -41,7 +41,7 @@ IMPLIED = {
     "env.distinct_histories": True,  # as TorchRL's LSTMModule has it; the same numbers, slower
     "env.hidden_size": 128,  # of the LSTM, which was the only policy
     "loss.score": "return",
-    "loss.surprise": "nats",
+    "loss.entropy": "nats",
     "policy.name": "lstm",
     "policy.window": "None",
     "policy.hidden_size": 128,

@@ -11,8 +11,8 @@ from torchrl_ecpo.checks import check_choice, check_flag
 from torchrl_ecpo.functional import (
     Surrogate,
     lifted_log_weights,
+    matched_temperature,
     mean_seeking_projection,
-    pooled_deviation,
 )
 from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, Score, TrajectoryGroups
 
@@ -43,11 +43,11 @@ class ECPOLoss(LiftProjectLoss):
             tau_prime / (tau + tau_prime). Defaults to 0.01, where the runs on the same tasks
             start; anneal it towards 0 where the task asks for a deterministic policy. 0 is the
             paper's ablation.
-        surprise: the unit of -log pi_bar(rho), which tau_prime weighs. ``"nats"`` (default, the
-            paper's), or ``"deviation"``: its deviation within groups, pooled over the batch, if
-            that is above a nat. The deviation grows with the trajectories' length and falls with
-            the entropy, so that one tau_prime serves short and long trajectories; a score that is
-            standardised too makes both temperatures dimensionless.
+        entropy: what tau_prime weighs. ``"nats"`` (default, the paper's): the surprise
+            -log pi_bar(rho). ``"matched"``: the surprise scaled so that it spreads within groups as
+            far as the scores do (:func:`~torchrl_ecpo.functional.matched_temperature`); one
+            tau_prime then serves short and long trajectories, early and late. Needs scores in
+            deviations: ``score="group"`` or ``"batch"``.
         control_variate: if True, the self-normalised ratios pi_theta/pi_bar are subtracted from
             the weights, which removes the drift of groups without a preference. Defaults to False
             (the paper).
@@ -95,7 +95,7 @@ class ECPOLoss(LiftProjectLoss):
         *,
         tau: float = 0.5,
         tau_prime: float = 0.01,
-        surprise: Literal["nats", "deviation"] = "nats",
+        entropy: Literal["nats", "matched"] = "nats",
         control_variate: bool = False,
         score: Score = "return",
         delay_actor: bool = False,
@@ -109,17 +109,22 @@ class ECPOLoss(LiftProjectLoss):
             delay_actor=delay_actor,
             reduction=reduction,
         )
-        check_choice("surprise", surprise, ("nats", "deviation"))
-        self.surprise = surprise
+        check_choice("entropy", entropy, ("nats", "matched"))
+        if entropy == "matched" and score == "return":
+            raise ValueError(
+                "entropy='matched' needs scores in deviations: score='group' or 'batch', got "
+                "score='return'."
+            )
+        self.entropy = entropy
         self.control_variate = check_flag("control_variate", control_variate)
 
     def lift(self, groups: TrajectoryGroups) -> Tensor:
-        """Eq. 5, with the surprise in its unit."""
+        """Eq. 5, at the matched tau' if that is asked for."""
         tau, tau_prime = self.temperatures()
-        reference = groups.reference_log_prob
-        if self.surprise == "deviation":
-            tau_prime = tau_prime / pooled_deviation(reference, mask=groups.mask).clamp_min(1)
-        return lifted_log_weights(groups.scores, reference, tau=tau, tau_prime=tau_prime)
+        score, reference = groups.scores, groups.reference_log_prob
+        if self.entropy == "matched":
+            tau_prime = matched_temperature(tau_prime, score, reference, mask=groups.mask)
+        return lifted_log_weights(score, reference, tau=tau, tau_prime=tau_prime)
 
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
         """Eq. 6, with weights corrected for the policy that drew the trajectories."""

@@ -37,7 +37,7 @@ class REPSLoss(ECPOLoss):
             (ours).
         tau: where the temperature starts, in the unit of the score. Defaults to 1.
         tau_prime: temperature of the entropy. Defaults to 0 (REPS has none).
-        surprise: see :class:`ECPOLoss`. Defaults to ``"nats"``.
+        entropy: see :class:`ECPOLoss`. Defaults to ``"nats"``.
         control_variate: see :class:`ECPOLoss`. Defaults to False.
         score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
         delay_actor: see :class:`ECPOLoss`. Defaults to False.
@@ -68,7 +68,7 @@ class REPSLoss(ECPOLoss):
         epsilon: float = 0.5,
         tau: float = 1.0,
         tau_prime: float = 0.0,
-        surprise: Literal["nats", "deviation"] = "nats",
+        entropy: Literal["nats", "matched"] = "nats",
         control_variate: bool = False,
         score: Score = "return",
         delay_actor: bool = False,
@@ -78,7 +78,7 @@ class REPSLoss(ECPOLoss):
             actor_network,
             tau=tau,
             tau_prime=tau_prime,
-            surprise=surprise,
+            entropy=entropy,
             control_variate=control_variate,
             score=score,
             delay_actor=delay_actor,
