@@ -112,6 +112,7 @@ def make_algorithmic(config: DictConfig) -> Task:
         nvec=action_spec.nvec[0, 0].tolist(),
         hidden_size=config.policy.hidden_size,
         window=config.policy.window,
+        tables=config.policy.tables,
     )
     evaluation = Evaluation(config.env.name, actor, config.seed + 1_000_000)
 

@@ -44,6 +44,7 @@ IMPLIED = {
     "loss.entropy": "nats",
     "policy.name": "lstm",
     "policy.window": "None",
+    "policy.tables": False,
     "policy.hidden_size": 128,
     "epochs": 1,
     "max_kl": "None",
@@ -78,14 +79,15 @@ class Study:
     title: str
     tasks: tuple[str, ...]
     methods: Mapping[str, str | Mapping[str, Any]]
-    """Options of the script; or these and a ``grid`` of values of further options."""
+    """Options of the script; or a mapping with these, and a ``grid`` of values of further options
+    or ``seeds`` of its own."""
     seeds: tuple[int, ...]
     about: str = ""
     kind: str = "curves"
     rank_by: str = "area"
     """Of a ranking: the score by which settings are ordered."""
-    steps: int | None = None
-    """Instead of the task's."""
+    steps: int | Mapping[str, int] | None = None
+    """Instead of the task's; by task, or of all."""
     also: tuple[str, ...] = ()
     """Further metrics, each drawn in a figure of its own."""
     scale_by: str | None = None
@@ -201,8 +203,8 @@ class Manifest:
                 method=method,
                 setting=setting,
                 options=(*shlex.split(task.options or f"env={task.name}"), *options),
-                seeds=study.seeds,
-                steps=study.steps or task.steps,
+                seeds=_seeds_of(plan) or study.seeds,
+                steps=_steps_of(study, task),
             )
             for task in (self.tasks[name] for name in study.tasks)
             for method, plan in study.methods.items()
@@ -240,6 +242,16 @@ class Manifest:
         return selected
 
 
+def _steps_of(study: Study, task: Task) -> int:
+    own = study.steps
+    return (own.get(task.name) if isinstance(own, Mapping) else own) or task.steps
+
+
+def _seeds_of(plan: str | Mapping[str, Any]) -> tuple[int, ...]:
+    has_own = isinstance(plan, Mapping) and "seeds" in plan
+    return parse_seeds(plan["seeds"]) if has_own else ()
+
+
 def _settings(
     plan: str | Mapping[str, Any],
 ) -> list[tuple[tuple[tuple[str, str], ...], tuple[str, ...]]]:
@@ -251,7 +263,7 @@ def _settings(
             (str(axis), str(value), shlex.split(options[value]) if named else [f"{axis}={value}"])
             for value in options
         ]
-        for axis, options in plan["grid"].items()
+        for axis, options in plan.get("grid", {}).items()
         for named in [isinstance(options, Mapping)]
     ]
     return [
@@ -343,15 +355,23 @@ def _read_study(where: str, name: str, entry: object, tasks: Mapping[str, Task])
         raise ValueError(f"{where}: kind must be one of {KINDS}, got {study.kind!r}.")
     if study.rank_by not in RANKS:
         raise ValueError(f"{where}: rank_by must be one of {RANKS}, got {study.rank_by!r}.")
-    if study.steps is not None:
-        _check_steps(where, study.steps)
+    if isinstance(study.steps, Mapping):
+        _check_names("steps", study.steps, study.tasks)
+    steps = study.steps.values() if isinstance(study.steps, Mapping) else [study.steps]
+    for number in steps:
+        if number is not None:
+            _check_steps(where, number)
     for method, plan in study.methods.items():
-        if not isinstance(plan, str) and set(plan) != {"options", "grid"}:
+        if not isinstance(plan, str) and not {"options"} < set(plan) <= {
+            "options",
+            "grid",
+            "seeds",
+        }:
             raise ValueError(
                 f"{where}: method {method} must be options of the script, or a mapping with "
-                f"options and grid, got {plan!r}."
+                f"options and grid or seeds, got {plan!r}."
             )
-        if study.kind == "curves" and not isinstance(plan, str):
+        if study.kind == "curves" and not isinstance(plan, str) and "grid" in plan:
             raise ValueError(
                 f"{where}: method {method} has a grid, which needs kind: ranking or heat_map."
             )

@@ -10,16 +10,18 @@ from torchrl_ecpo.modules.actor_critic import (
 from torchrl_ecpo.modules.latents import record_latents
 from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
 from torchrl_ecpo.modules.softmax import LinearSoftmax, SharedCategorical, make_softmax_policy
-from torchrl_ecpo.modules.tuple_policy import TupleCategorical, make_tuple_policy
-from torchrl_ecpo.modules.windows import DistinctWindowNetwork
+from torchrl_ecpo.modules.tuple_policy import TupleCategorical, TupleTables, make_tuple_policy
+from torchrl_ecpo.modules.windows import DistinctWindowNetwork, OneHotLinear
 
 __all__ = [
     "DenseNetwork",
     "DistinctHistoryLSTM",
     "DistinctWindowNetwork",
     "LinearSoftmax",
+    "OneHotLinear",
     "SharedCategorical",
     "TupleCategorical",
+    "TupleTables",
     "make_deterministic_actor",
     "make_qvalue_network",
     "make_softmax_policy",

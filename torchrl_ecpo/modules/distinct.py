@@ -16,7 +16,6 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torch.nn import functional as F
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import TensorDictPrimer
 from torchrl.modules import recurrent_mode
@@ -170,19 +169,6 @@ class DistinctCore(TensorDictModuleBase):
                 f"values from {flat.amin(0).tolist()} to {flat.amax(0).tolist()}."
             )
         return (classes * weights).sum(-1)
-
-    def project_by(self, weight: Tensor, bias: Tensor, symbols: Tensor) -> Tensor:
-        """A linear layer, weight `[H, C]`, on the one-hot vectors of symbols `[n]`: `[n, H]`.
-
-        A one-hot product is a sum of columns; column C is 0.
-        """
-        columns = F.pad(weight.t(), (0, 0, 0, 1))
-        return F.embedding_bag(self.hot(symbols), columns, mode="sum") + bias
-
-    def hot(self, symbols: Tensor) -> Tensor:
-        """Where the one-hot vectors of symbols `[*B]` are 1, `[*B, d]`."""
-        sizes, weights, offsets, *_ = radix(self.num_classes, symbols.device)
-        return symbols.unsqueeze(-1) // weights % sizes + offsets
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """The transform that lets an environment carry the states from step to step.

@@ -8,10 +8,11 @@ from typing import Any
 import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
+from torch.nn import functional as F
 from torchrl.data import TensorSpec, Unbounded
 
 from torchrl_ecpo.checks import check_count
-from torchrl_ecpo.modules.distinct import DistinctCore, Evaluated, as_readout
+from torchrl_ecpo.modules.distinct import DistinctCore, Evaluated, as_readout, radix
 from torchrl_ecpo.modules.histories import (
     Histories,
     LSTMOverHistories,
@@ -159,5 +160,8 @@ class DistinctHistoryLSTM(DistinctCore):
         return self.readout(h)
 
     def project_by_cell(self, cell: nn.LSTMCell, symbols: Tensor) -> Tensor:
-        """The same by a given cell."""
-        return self.project_by(cell.weight_ih, cell.bias_ih + cell.bias_hh, symbols)
+        """The same by a given cell. A one-hot product is a sum of columns."""
+        sizes, weights, offsets, *_ = radix(self.num_classes, symbols.device)
+        hot = symbols.unsqueeze(-1) // weights % sizes + offsets
+        columns = F.embedding_bag(hot, cell.weight_ih.t().contiguous(), mode="sum")
+        return columns + (cell.bias_ih + cell.bias_hh)

@@ -20,9 +20,9 @@ from torchrl.modules import LSTMModule, ProbabilisticActor
 from torchrl_ecpo.checks import check_count, check_counts, check_flag, check_kind, described
 from torchrl_ecpo.modules.distinct import DistinctCore, Evaluated, take_rows
 from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
-from torchrl_ecpo.modules.windows import DistinctWindowNetwork
+from torchrl_ecpo.modules.windows import DistinctWindowNetwork, OneHotLinear
 
-__all__ = ["TupleCategorical", "make_tuple_policy"]
+__all__ = ["TupleCategorical", "TupleTables", "make_tuple_policy"]
 
 
 def _num_logits(nvec: Sequence[int]) -> int:
@@ -276,12 +276,97 @@ class TupleCategorical(Distribution):
             )
 
 
+class TupleTables(nn.Module):
+    """A policy's network with tables beside its hidden layer: it may remember, where it helps.
+
+    The hidden layer sees the present observation and the previous action, as a policy without
+    memory. Two tables, 0 at first, add to its logits:
+
+    - to those of the character: one row for each sequence of the last `window` observations and
+      the last character written; none where one of these observations is a blank;
+    - to those of the move: one row for the last two moves; none at a blank.
+
+    A network over the whole window learns each of many cases through all others; a row of a table
+    is of one case. Without a table at blanks, nothing is recited where the input has ended.
+
+    Args:
+        num_classes: the number of classes of the observation (the blank is the last) and of the
+            previous action's parts, each with one more for none.
+        window: how many steps are seen, at least 2.
+        hidden_size: of the hidden layer (ReLU).
+        device: of the parameters.
+        dtype: of the parameters.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_ecpo.modules import TupleTables
+        >>> network = TupleTables([4, 5, 3, 4], window=4, hidden_size=8)
+        >>> network(torch.zeros(6, 4, 4, dtype=torch.int64)).shape  # 4 moves, 2 flags, 3 characters
+        torch.Size([6, 9])
+    """
+
+    CHARACTER_STEP, MOVE_STEP = 2.0, 4.0
+    """By how much a gradient step moves a table's row further than other parameters: Adam's steps
+    do not depend on the gradient's size, so that a factor on the table is one on its steps."""
+
+    def __init__(
+        self,
+        num_classes: Sequence[int],
+        window: int,
+        hidden_size: int = 64,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        super().__init__()
+        self.window = check_count("window", window, least=2)
+        factory: dict[str, Any] = {"device": device, "dtype": dtype}
+        observations, moves, _, characters = self.num_classes = check_counts(
+            "num_classes", num_classes
+        )
+        self.num_moves, self.num_characters = moves - 1, characters - 1
+        num_logits = self.num_moves + 2 + self.num_characters
+        self.hidden = OneHotLinear(self.num_classes, hidden_size, **factory)
+        self.readout = nn.Linear(hidden_size, num_logits, **factory)
+        num_rows = (observations + 1) ** window * characters
+        self.characters = nn.Parameter(torch.zeros(num_rows, self.num_characters, **factory))
+        self.moves = nn.Parameter(torch.zeros((moves + 1) ** 2, self.num_moves, **factory))
+
+    def forward(self, classes: Tensor) -> Tensor:
+        """The logits of windows.
+
+        Args:
+            classes: int64 `[n, window, 4]`, the present step first; -1 where there is none.
+
+        Returns:
+            `[n, L]`.
+        """
+        observation, move, write, character = classes.unbind(-1)
+        blank, moves = self.num_classes[0] - 1, self.num_classes[1]
+        logits = self.readout(self.hidden(classes[:, 0]).relu())
+        by_move, _, by_character = logits.split([self.num_moves, 2, self.num_characters], -1)
+
+        is_written = write == 1
+        last = is_written.int().argmax(-1, keepdim=True)
+        written = (character.gather(-1, last) + 1).where(is_written.any(-1, keepdim=True), 0)
+        place = written.squeeze(-1)
+        for seen in observation.unbind(-1):
+            place = place * (blank + 2) + seen + 1
+        is_inside = (observation != blank).all(-1, keepdim=True)
+        of_character = self.CHARACTER_STEP * take_rows(self.characters, place) * is_inside
+
+        place = (move[:, 0] + 1) * (moves + 1) + move[:, 1] + 1
+        of_move = self.MOVE_STEP * take_rows(self.moves, place) * (observation[:, :1] != blank)
+        added = [by_move + of_move, logits[:, self.num_moves :][:, :2], by_character + of_character]
+        return torch.cat(added, -1)
+
+
 def make_tuple_policy(
     num_observations: int,
     nvec: Sequence[int],
     *,
     hidden_size: int = 128,
     window: int | None = None,
+    tables: bool = False,
     distinct_histories: bool = True,
     device: torch.device | str | None = None,
     dtype: torch.dtype | None = None,
@@ -301,6 +386,8 @@ def make_tuple_policy(
         hidden_size: of the LSTM, or of the hidden layer. Default 128 (the UREX paper's).
         window: how many steps a policy without LSTM sees, 1 for the present one alone
             (:class:`DistinctWindowNetwork`). Default None: the LSTM.
+        tables: whether tables read what lies before the present step (:class:`TupleTables`).
+            Default False: the hidden layer does.
         distinct_histories: whether rows with equal histories are computed once
             (:class:`DistinctHistoryLSTM`), or each row by :class:`torchrl.modules.LSTMModule`. The
             numbers and the order of the parameters are the same.
@@ -343,15 +430,13 @@ def make_tuple_policy(
     core: Any
     readout = nn.Linear(hidden_size, _num_logits(nvec), **factory)
     if window is not None:
-        core = DistinctWindowNetwork(
-            num_classes,
-            hidden_size,
-            window,
-            nn.Sequential(nn.ReLU(), readout),
-            in_keys=inputs,
-            out_key="logits",
-            **factory,
-        )
+        network: nn.Module
+        if check_flag("tables", tables):
+            network = TupleTables(num_classes, window, hidden_size, **factory)
+        else:
+            sizes = num_classes * check_count("window", window)
+            network = nn.Sequential(OneHotLinear(sizes, hidden_size, **factory), nn.ReLU(), readout)
+        core = DistinctWindowNetwork(num_classes, network, window, in_keys=inputs, out_key="logits")
     elif check_flag("distinct_histories", distinct_histories):
         core = DistinctHistoryLSTM(
             num_classes,

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.data import TensorSpec, Unbounded
 
-from torchrl_ecpo.checks import check_count, described
-from torchrl_ecpo.modules.distinct import DistinctCore, Evaluated, as_readout
+from torchrl_ecpo.checks import check_count, check_counts, check_kind, described
+from torchrl_ecpo.modules.distinct import DistinctCore, Evaluated, radix
 
-__all__ = ["DistinctWindowNetwork"]
+__all__ = ["DistinctWindowNetwork", "OneHotLinear"]
 
 STATE_KEY = "window"
 FEW = 1024
@@ -25,12 +25,11 @@ FEW = 1024
 class DistinctWindowNetwork(DistinctCore):
     """A feed-forward network over the last inputs that computes each distinct window once.
 
-    A linear layer over the one-hot vectors of the last `window` inputs, then the readout. What a
-    batch of trajectories has in its windows repeats: a window of one has a few dozen values in
-    thousands of steps. It takes the place of :class:`DistinctHistoryLSTM`, in sampling and in
+    What a batch of trajectories has in its windows repeats: a window of one has a few dozen values
+    in thousands of steps. It takes the place of :class:`DistinctHistoryLSTM`, in sampling and in
     recurrent mode (:class:`torchrl.modules.set_recurrent_mode`, whole sequences `[*B, T]`).
 
-    - Places of the window before `is_init` are empty: their part of the layer is 0.
+    - Places of the window before `is_init` are empty: the network sees -1 there.
     - With `window` = 1 (a policy without memory) nothing else is read and no state travels.
       Otherwise the inputs before the present one travel as one number, int64 `[*B, 1]`. In
       recurrent mode every sequence begins with a trajectory's first step.
@@ -38,18 +37,12 @@ class DistinctWindowNetwork(DistinctCore):
     Args:
         num_classes: the number of classes of each input, in the order of the input keys and of
             their last dimensions.
-        hidden_size: H, the width of the linear layer. Default 128.
+        network: makes the outputs `[n, *]` of windows `[n, window, d]` (int64, the present input
+            first, then those before; -1 where there is none), for example :class:`OneHotLinear`
+            and what follows.
         window: how many inputs are seen, the present one among them. Default 1.
-        readout: a module that is applied to each distinct output `[n, H]`, for example a
-            nonlinearity and a linear layer to logits. Default None: the output is the first
-            layer's.
         in_keys: the integer inputs, each `[*B]` or `[*B, d]`.
         out_key: the output. Default "embed".
-        device: of the parameters.
-        dtype: of the parameters.
-
-    Attributes:
-        layer: the `torch.nn.Linear` over `window` one-hot vectors, the present one first.
 
     Raises:
         KeyError: if `is_init` is missing, or the state of a row that continues (`window` > 1).
@@ -61,8 +54,10 @@ class DistinctWindowNetwork(DistinctCore):
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl.modules import set_recurrent_mode
-        >>> from torchrl_ecpo.modules import DistinctWindowNetwork
-        >>> network = DistinctWindowNetwork([4, 3], 8, 2, in_keys=["observation", "last_action"])
+        >>> from torchrl_ecpo.modules import DistinctWindowNetwork, OneHotLinear
+        >>> network = DistinctWindowNetwork(
+        ...     [4, 3], OneHotLinear([4, 3, 4, 3], 8), 2, in_keys=["observation", "last_action"]
+        ... )
         >>> data = TensorDict(
         ...     observation=torch.randint(4, (6, 10)),
         ...     last_action=torch.randint(3, (6, 10)),
@@ -77,20 +72,16 @@ class DistinctWindowNetwork(DistinctCore):
     def __init__(
         self,
         num_classes: Sequence[int],
-        hidden_size: int = 128,
+        network: nn.Module,
         window: int = 1,
-        readout: nn.Module | None = None,
         *,
         in_keys: Sequence[NestedKey],
         out_key: str = "embed",
-        device: torch.device | str | None = None,
-        dtype: torch.dtype | None = None,
     ) -> None:
         self.window = check_count("window", window)
         self.needs_starts = self.window > 1
         self.state_keys = [STATE_KEY] * self.needs_starts
         super().__init__(num_classes, in_keys=in_keys, out_key=out_key)
-        self.hidden_size = check_count("hidden_size", hidden_size)
         # The digits of a window's number are its symbols, 0 for none, the present one last.
         self.base = self.num_symbols + 1
         self.num_windows = self.base**self.window
@@ -98,9 +89,8 @@ class DistinctWindowNetwork(DistinctCore):
             raise ValueError(
                 f"window: expected at most 2^62 different windows, got {self.base}^{self.window}."
             )
-        factory: dict[str, Any] = {"device": device, "dtype": dtype}
-        self.layer = nn.Linear(self.window * sum(self.num_classes), self.hidden_size, **factory)
-        self.readout = as_readout(readout)
+        check_kind("network", network, nn.Module)
+        self.network = network
         self._table: Tensor | None = None
 
     def state_specs(self) -> dict[NestedKey, TensorSpec]:
@@ -163,18 +153,58 @@ class DistinctWindowNetwork(DistinctCore):
 
     def read_out(self, windows: Tensor) -> Tensor:
         """The output of each window `[n]`."""
-        return self.readout(self.project_by(self.layer.weight, self.layer.bias, windows))
+        return self.network(self.classes(windows))
 
-    def hot(self, symbols: Tensor) -> Tensor:
-        """Where the one-hot vectors of windows `[n]` are 1, `[n, window * d]`.
+    def classes(self, windows: Tensor) -> Tensor:
+        """What windows `[n]` consist of, `[n, window, d]`; -1 where they are empty."""
+        sizes, weights, *_ = radix(self.num_classes, windows.device)
+        places = self.base ** torch.arange(self.window, device=windows.device)
+        digits = (windows.unsqueeze(-1) // places % self.base).unsqueeze(-1)
+        return ((digits - 1) // weights % sizes).where(digits > 0, -1)
 
-        Those of empty places are at the row after the last.
+
+class OneHotLinear(nn.Linear):
+    """A linear layer on the one-hot vectors of integers, as the sum of some columns.
+
+    Args:
+        num_classes: the number of classes of each integer.
+        out_features: H.
+        device: of the parameters.
+        dtype: of the parameters.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_ecpo.modules import OneHotLinear
+        >>> layer = OneHotLinear([4, 3], 8)
+        >>> layer(torch.tensor([[3, 0], [1, -1]])).shape
+        torch.Size([2, 8])
+    """
+
+    offsets: Tensor
+
+    def __init__(
+        self,
+        num_classes: Sequence[int],
+        out_features: int,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        sizes = check_counts("num_classes", num_classes)
+        super().__init__(sum(sizes), out_features, device=device, dtype=dtype)
+        sizes = torch.tensor(sizes, device=device)
+        self.register_buffer("offsets", sizes.cumsum(0) - sizes, persistent=False)
+
+    def forward(self, classes: Tensor) -> Tensor:
+        """Apply it.
+
+        Args:
+            classes: int64 `[n, *]`, as many a row as there are in `num_classes`; -1 has the zero
+                vector.
+
+        Returns:
+            `[n, H]`.
         """
-        num_columns = sum(self.num_classes)
-        parts = []
-        for lag in range(self.window):
-            digit = symbols // self.base**lag % self.base
-            columns = super().hot(digit - 1) + lag * num_columns
-            is_empty = (digit == 0).unsqueeze(-1)
-            parts.append(columns.masked_fill(is_empty, self.window * num_columns))
-        return torch.cat(parts, -1)
+        classes = classes.flatten(1)
+        hot = (classes + self.offsets).where(classes >= 0, self.in_features)
+        columns = F.pad(self.weight.t(), (0, 0, 0, 1))  # the last one is of -1
+        return F.embedding_bag(hot, columns, mode="sum") + self.bias

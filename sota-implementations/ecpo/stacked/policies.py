@@ -238,21 +238,20 @@ class _StackedWindowNetwork(DistinctWindowNetwork):
     """The window network of each run. A window says which run it belongs to."""
 
     cells: Any
-    """Layer and readout of each run."""
+    """The network of each run."""
 
     def __init__(self, cores: Sequence[DistinctWindowNetwork]) -> None:
         first = cores[0]
         super().__init__(
             first.num_classes,
-            first.hidden_size,
+            nn.Identity(),
             first.window,
             in_keys=first.input_keys,
             out_key=str(first.out_keys[0]),
         )
-        del self.layer, self.readout
         in_keys: list[Any] = [*self.in_keys, "run"]
         self.in_keys = in_keys
-        self.cells = nn.ModuleList(nn.ModuleList([core.layer, core.readout]) for core in cores)
+        self.cells = nn.ModuleList(core.network for core in cores)
         self.num_windows *= len(cores)
 
     def read_symbols(self, tensordict: TensorDictBase) -> Tensor:
@@ -264,13 +263,8 @@ class _StackedWindowNetwork(DistinctWindowNetwork):
 
     def read_out(self, windows: Tensor) -> Tensor:
         run, own = windows // self.base**self.window, windows % self.base**self.window
-        parts = own.split(_count(run, self.cells))
-        return torch.cat(
-            [
-                readout(self.project_by(layer.weight, layer.bias, part))
-                for (layer, readout), part in zip(self.cells, parts, strict=True)
-            ]
-        )
+        parts = self.classes(own).split(_count(run, self.cells))
+        return torch.cat([cell(part) for cell, part in zip(self.cells, parts, strict=True)])
 
 
 def _count(runs: Tensor, cells: Sequence[Any]) -> list[int]:
