@@ -26,6 +26,7 @@ SCRIPTS = HERE.parent
 MANIFESTS = [HERE / "study.yaml", HERE / "search.yaml"]
 KINDS = ("curves", "heat_map", "ranking")
 RANKS = ("area", "final")
+PLANS = ({"options", "grid"}, {"options", "seeds"}, {"options", "grid", "seeds"})
 # Runs that differ in these alone have the same numbers, as far as both go: the entries of env are
 # those that other entries are or were read from, the last is how Q networks are called.
 NOT_THE_RUN = (
