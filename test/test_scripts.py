@@ -7,6 +7,7 @@ import json
 import math
 import shutil
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -141,11 +142,18 @@ def test_a_run_stops_once_it_holds_its_goal_and_is_finished(tmp_path):
     options = ("seed=1", "total_trajectories=200")
     run_ecpo(tmp_path, *options, f"hydra.run.dir={free}")
     metrics = read_metrics(free)
-    goal = sorted(metrics["return"])[len(metrics["return"]) // 2]
-    is_held = [value >= goal for value in metrics["return"]]
-    pairs = [a and b for a, b in zip(is_held, is_held[1:], strict=False)]
-    last = pairs.index(True) + 2
-    assert sum(is_held[:last]) > 2, "it is not the second time that counts"
+
+    def batches_until(goal):
+        """Until it was held twice in a row, and how often it was held."""
+        is_held = [value >= goal for value in metrics["return"]]
+        pairs = [a and b for a, b in pairwise(is_held)]
+        last = pairs.index(True) + 2 if True in pairs else len(is_held)
+        return last, sum(is_held[:last])
+
+    # One that is held once before it is held twice.
+    goal = next(g for g in metrics["return"] if batches_until(g)[1] == 3)
+    last, _ = batches_until(goal)
+    assert last < len(metrics["step"])
     goal = f"stop_when={{metric:return,at_least:{goal},batches:2}}"
     run_ecpo(tmp_path, *options, goal, f"hydra.run.dir={stopped}")
     before = read_metrics(stopped)
@@ -286,6 +294,8 @@ def test_distinct_solutions_are_counted(script_modules):
         },
         batch_size=[2, 4, 2],
     )
+    assert tasks.is_solved(groups).tolist() == [[True, True, True, False], [True] * 4]
+    assert tasks.attained(groups) == (7 * 2 + 0.5) / 16
     # First group: one (twice) and other; second: one, silent (twice), and the short one.
     assert tasks.distinct_solutions(groups) == (2 + 3) / 2
     groups["next", "reward"].zero_()

@@ -494,7 +494,10 @@ def test_a_run_that_stopped_early_is_whole(study, tmp_path, counter, has_goal):
     assert row["reached"] == ("200" if has_goal else "100")
     assert row["stopped_at"] == ("100" if has_goal else "")
     assert [point["step"] for point in curve] == [*range(2, 201 if has_goal else 101, 2)]
-    assert curve[:2] == [{"step": 2, "return": 1.5, "entropy": 7}, {"step": 4, "return": 3.5, "entropy": 7}]
+    assert curve[:2] == [
+        {"step": 2, "return": 1.5, "entropy": 7},
+        {"step": 4, "return": 3.5, "entropy": 7},
+    ]
     for point in curve[50:]:
         assert point == {"step": point["step"], "return": 4, "entropy": 7}
     assert not results.add(cell, record, ["return", "entropy"]), "it is there"

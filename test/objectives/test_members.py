@@ -180,11 +180,12 @@ def test_reps_matches_the_entropy_as_ecpo_does():
 
 @pytest.mark.parametrize("loss_class", [ECPOLoss, REPSLoss])
 def test_returns_have_no_deviation_to_match(loss_class):
-    with pytest.raises(ValueError, match="entropy='matched' needs .*'group' or 'batch', got"):
+    with pytest.raises(ValueError, match=r"entropy='matched' needs .*'group' or 'batch', got"):
         loss_class(make_actor(), entropy="matched")
-    with pytest.raises(ValueError, match=r"entropy must be one of \('nats', 'matched'\), got 'foo'"):
+    with pytest.raises(
+        ValueError, match=r"entropy must be one of \('nats', 'matched'\), got 'foo'"
+    ):
         loss_class(make_actor(), entropy="foo")
-
 
 
 def test_weights_stay_while_the_policy_is_projected():
