@@ -39,8 +39,10 @@ ALGORITHMIC_TASKS = {
     "reversed_addition": "ReversedAddition",
 }
 # Second column of a table of defaults: the configurations that it speaks of. They are those of the
-# loss of that name, or else of the loss that the page is named after, or else of ECPO.
+# loss of that name, or else of the loss that the page is named after, or else of ECPO; of ecpo.py
+# with the form and policy of the first study, but for the recipe's own.
 STATED_FOR = {
+    "the recipe, algorithmic tasks": (ECPO_CONFIG, ALGORITHMIC_TASKS),
     "algorithmic tasks": (ECPO_CONFIG, ALGORITHMIC_TASKS),
     "bandit": (ECPO_CONFIG, ("bandit",)),
     "gymnasium": (ECPO_CONFIG, ("gym",)),
@@ -157,8 +159,11 @@ def test_stated_defaults_are_those_of_the_configuration(page):
         losses = {path.stem for path in (directory / "loss").glob("*.yaml")}
         named = (heading.lower().replace("-", "_"), page.stem, "ecpo")
         loss = next(name for name in named if name in losses)
+        is_paper = directory is ECPO_CONFIG and "recipe" not in heading
+        form = ("form=paper",) if is_paper else ()
+        form += ("policy=lstm",) if is_paper and "copy" in tasks else ()
         for (option, stated), task in product(DEFAULT.findall(rows), tasks):
-            config = composed(directory, (f"env={task}", f"loss={loss}"))
+            config = composed(directory, (f"env={task}", f"loss={loss}", *form))
             value = OmegaConf.select(config, option, throw_on_resolution_failure=True)
             value = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
             assert value == yaml.safe_load(stated), f"{option} with env={task}"
@@ -178,7 +183,7 @@ def test_the_settings_that_the_search_chose_are_those_of_the_configuration():
         }
         assert set(stated) == {"env.curriculum", "loss.tau"}
         for place, loss in enumerate(losses):
-            config = composed(ECPO_CONFIG, (f"env={task}", f"loss={loss}"))
+            config = composed(ECPO_CONFIG, (f"env={task}", f"loss={loss}", "form=paper"))
             for option, values in stated.items():
                 assert str(OmegaConf.select(config, option)) == values[place], (task, loss)
             asked = OmegaConf.from_dotlist(optimisers[config.env.curriculum].split())
@@ -210,6 +215,6 @@ def test_the_page_of_equations_names_tests_that_exist():
 
 def test_a_wrong_option_is_noticed():
     script = ROOT / "sota-implementations/ecpo/ecpo.py"
-    compose_command(script, " --multirun loss=ecpo,ment seed='range(0,2)' # a comment")
+    compose_command(script, " --multirun form=paper loss=ecpo,ment seed='range(0,2)' # a comment")
     with pytest.raises(Exception, match="no_such_option"):
         compose_command(script, "env=copy loss.no_such_option=1")

@@ -28,6 +28,7 @@ from torchrl_ecpo.functional import (
     lift_divergence_estimate,
     lifted_log_weights,
     masked_mean,
+    matched_temperature,
     mean_seeking_projection,
     ment_surrogate,
     mode_seeking_projection,
@@ -870,6 +871,52 @@ def test_scores_in_the_deviation_of_the_batch(x, scale, data):
     mask = torch.cat([mask, torch.tensor([[True, True, True, False]])])
     more = standardised_in_batch(more, mask=mask)
     assert_close(more, torch.cat([actual, torch.zeros(1, 4)]) * math.sqrt(12 / 9))
+
+
+@DTYPES
+@pytest.mark.parametrize("junk", [7.0, math.nan, math.inf])
+def test_matched_temperature_by_hand(dtype, junk):
+    """Distances of scores 1, 1; 0, 0, of surprise 3, 3; 1, 1: mean squares 1/2 and 5."""
+    score = torch.tensor([[-1.0, junk, 1.0], [0.0, 0.0, junk]], dtype=dtype)
+    log_prob = torch.tensor([[-8.0, junk, -2.0], [-5.0, -3.0, junk]], dtype=dtype)
+    mask = torch.tensor([[True, False, True], [True, True, False]])
+    found = matched_temperature(0.4, score, log_prob, mask=mask)
+    assert_close(found, torch.tensor(0.4 * math.sqrt((1 / 2 + 1 / 2) / 5), dtype=dtype))
+    # A score for all groups counts in each: mean square 1/2, and still two groups.
+    score = torch.tensor([-1.0, 0.0, 1.0], dtype=dtype)
+    found = matched_temperature(0.4, score, log_prob, mask=mask)
+    assert_close(found, torch.tensor(0.4 * math.sqrt((2.5 / 4 + 1 / 2) / 5), dtype=dtype))
+
+
+@pytest.mark.parametrize(
+    ("score", "log_prob", "expected"),
+    [
+        (((-1, 1),), ((-6, -2),), math.sqrt(2) / 2),  # one group
+        (((3, 3),) * 4, ((-6, -2),) * 4, math.sqrt(1 / 4) / 2),  # equal scores: 1/G
+        (((-1, 1),), ((-1.5, -1),), math.sqrt(2)),  # surprise within a nat is not blown up
+        (((-1, 1),), ((-2, -2),), math.sqrt(2)),
+    ],
+)
+def test_matched_temperature_at_its_edges(score, log_prob, expected):
+    tensors = (torch.tensor(x, dtype=torch.float64) for x in (score, log_prob))
+    assert_close(matched_temperature(1.0, *tensors).item(), expected)
+
+
+@PROPERTY
+@given(x=groups(k=8), tau_prime=st.floats(0, 9), scale=st.floats(1, 1e3))
+def test_the_matched_term_knows_no_unit_of_surprise(x, tau_prime, scale):
+    """Of at least a nat; and it spreads tau' times as far as the scores and 1/G."""
+    score, log_prob = standardised(x.score.view(2, 4)), x.reference.view(2, 4)
+    log_prob = log_prob + torch.tensor([-4.0, -1.0, 1.0, 4.0])
+    spread = centred(log_prob).square().mean().sqrt()
+    log_prob = log_prob / spread.clamp_max(1)
+    term, scaled = (
+        matched_temperature(tau_prime, score, surprise) * centred(surprise)
+        for surprise in (log_prob, scale * log_prob)
+    )
+    assert_close(scaled, term)
+    expected = tau_prime * (centred(score).square().mean() + 1 / 2).sqrt()
+    assert_close(term.square().mean().sqrt(), expected)
 
 
 def test_scores_are_held_constant_and_the_log_probability_is_not():

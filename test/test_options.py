@@ -35,6 +35,7 @@ def split(options):
         ("+device=cuda", "There is no option device; the nearest one is"),
         ("settings=group_curriculum", "no option settings; the nearest one is setting."),
         ("env.bandit.num_actions=3", "no option env.bandit.*nearest one is env.num_actions."),
+        ("env=copy env.hidden_size=8", "env.hidden_size; the nearest one is policy.hidden_size."),
         ("ecac +loss.tau=0.5", "no option loss.tau; the nearest one is loss.options.tau."),
         ("ecac +optim.lr=7", "no option optim.lr; the nearest one is loss.lr."),
         ("ecac loss=sac +loss.options.tau=1", "no option loss.options.tau"),
@@ -64,6 +65,12 @@ def split(options):
         ("optim.lr=nan", "optim.lr must be a number > 0, got nan."),
         ("loss.tau=-1", "loss.tau must be a number >= 0 or a schedule, got -1."),
         ("group_size=1", "group_size must be an integer >= 2, got 1."),
+        ("epochs=0", "epochs must be an integer >= 1, got 0."),
+        ("max_kl=-1", "max_kl must be a number >= 0 or null, got -1."),
+        ("env=copy policy.window=0", "policy.window must be an integer >= 1 or null, got 0."),
+        ("loss.entropy=bits", "loss.entropy must be nats or matched, got 'bits'."),
+        ("stop_when={metric:return,at_least:1}", "stop_when.batches must be given."),
+        ("stop_when={metric:return,at_least:1,batches:0}", "stop_when.batches must be an integer"),
         ("seed=-1", "seed must be an integer >= 0 and < 1000000, got -1."),
         ("seed=1000000", "seed must be an integer >= 0 and < 1000000, got 1000000."),
         ("checkpoint.keep=0", "checkpoint.keep must be an integer >= 1, got 0."),
@@ -89,13 +96,17 @@ def test_the_defaults_are_right_and_say_what_options_take(script):
     for path in (folder / "config").glob("[!s]*/*.yaml"):  # not the settings
         if path.stem in ("algorithmic", "gym"):
             continue  # incomplete
-        config = compose_options(folder, [f"{path.parent.name}={path.stem}"])
+        group = path.parent.name
+        task = ["env=copy"] if group in ("policy", "form") else []  # loss.tau is the form's
+        form = ["form=paper"] if script == "ecpo" and group == "loss" else []
+        config = compose_options(folder, [*task, *form, f"{group}={path.stem}"])
         entries = flatten(OmegaConf.to_container(config, resolve=True))
         names |= entries.keys()
         empty = {name for name, value in entries.items() if value == "None" and "ray" not in name}
         assert empty <= kinds.keys(), "null alone says nothing of what an option takes"
     optional = {name for name, kind in kinds.items() if kind.endswith("or nothing")}
-    optional |= {name for name in kinds if name.startswith("collector.backend_options")}
+    unset = ("collector.backend_options", "stop_when.")
+    optional |= {name for name in kinds if name.startswith(unset)}
     assert kinds.keys() - optional <= names, "an option that no configuration has"
 
 
@@ -126,10 +137,10 @@ def test_hydra_s_own_refusals_stand():
     ("options", "message"),
     [
         ("seed=0,1 loss.tau=0.1,fast --multirun", "ecpo.py: loss.tau must be .* got 'fast'"),
-        ("-m loss=ecpo,pmd loss.control_variate=true", "no option loss.control_variate"),
+        ("-m loss=ecpo,rloo loss.control_variate=true", "no option loss.control_variate"),
         ("-cn config env=chess", "Could not find 'env/chess'"),
         ("--multirun seed=1,2", "ecpo.py: seed 2 is refused"),
-        ("--multirun loss=glob(p*) seed=2", "ecpo.py: loss pmd is refused"),
+        ("--multirun loss=glob(r*) seed=2", "ecpo.py: loss reps is refused"),
     ],
 )
 def test_all_runs_of_a_command_line_are_checked(monkeypatch, options, message):
@@ -158,6 +169,10 @@ def test_hydra_s_own_flags_are_its_own(monkeypatch, options):
         ("compile=true seeds=[0,1]", "ecpo.py: compile=true is for single runs"),
         ("compile=true env=copy", "compile=true is for tasks of the kinds ('bandit', 'gym')"),
         ("stack=['seed=0','loss.tua=1']", "ecpo.py: There is no option loss.tua"),
+        ("env=copy policy=gru", "Could not find 'policy/gru' Available options in 'policy': lstm"),
+        ("form=book", "Could not find 'form/book' Available options in 'form': paper recipe"),
+        ("policy=lstm", "ecpo.py: Could not override 'policy'. No match in the defaults list.\n"),
+        ("+policy=lstm", "ecpo.py: policy= is for the algorithmic tasks, got env.kind='bandit'"),
         ("ecac --multirun gamma=0,2", "ecac.py: gamma must be a number >= 0 and <= 1, got 2."),
         ("ecac log_interval=70", "evaluation.interval must be a multiple of log_interval"),
         ("ecac total_frames=200", "total_frames must be a multiple of log_interval, or the last"),

@@ -7,6 +7,7 @@ import json
 import math
 import shutil
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,15 @@ def run_ecpo(directory, *overrides, afresh=False):
     assert process.returncode == 0, process.stderr
 
 
+@pytest.fixture
+def script_modules(monkeypatch):
+    """Imports what is beside the script, as if it were started from there."""
+    monkeypatch.syspath_prepend(str(ECPO.parent))
+    yield importlib.import_module
+    for name in ("tasks", "utils"):
+        sys.modules.pop(name, None)
+
+
 LOSSES = sorted(path.stem for path in (ECPO.parent / "config/loss").glob("*.yaml"))
 
 
@@ -46,6 +56,7 @@ def sweep(tmp_path_factory):
         directory,
         "--multirun",
         "loss=" + ",".join(LOSSES),
+        "form=paper",  # gives UREX, MENT and PMD their temperatures
         "seed=5",
         "project_steps=3",
         f"hydra.sweep.dir={directory}",
@@ -70,7 +81,7 @@ def test_every_loss_trains_on_the_bandit(sweep, loss):
 
 
 def test_the_same_seed_gives_the_same_run_in_another_process(sweep, tmp_path):
-    run_ecpo(tmp_path, "seed=5", "project_steps=3", f"hydra.run.dir={tmp_path}")
+    run_ecpo(tmp_path, "form=paper", "seed=5", "project_steps=3", f"hydra.run.dir={tmp_path}")
     assert read_metrics(tmp_path) == read_metrics(sweep / "ecpo")
 
 
@@ -78,6 +89,7 @@ def test_seeds_are_other_problems_and_schedules_and_ablations_are_options(sweep,
     run_ecpo(
         tmp_path,
         "--multirun",
+        "form=paper",
         "seed=6",
         "project_steps=1",
         "loss.tau_prime={schedule:linear,start:0.5,end:0.0,duration:40},0",
@@ -91,6 +103,67 @@ def test_seeds_are_other_problems_and_schedules_and_ablations_are_options(sweep,
     assert set(without_entropy["kl_reference_policy"]) == {0}, "one step a lift: no projection"
 
 
+def test_several_gradient_steps_on_a_batch(tmp_path):
+    run_ecpo(
+        tmp_path,
+        "--multirun",
+        "seed=5",
+        "epochs=1,3",
+        f"hydra.sweep.dir={tmp_path}",
+        "hydra.sweep.subdir=${hydra:job.num}",
+    )
+    one, three = read_metrics(tmp_path / "0"), read_metrics(tmp_path / "1")
+    assert {*one["gradient_steps"]} == {1}
+    assert {*three["gradient_steps"]} == {3}
+    assert {*one["kl_reference_policy"]} == {0}, "of the policy before the only step"
+    assert 0 not in three["kl_reference_policy"]
+    # What a batch says of the policy that drew it, which is the same in the first one.
+    changed = {name for name in one if one[name][0] != three[name][0]}
+    assert changed == {"kl_reference_policy", "gradient_steps", "expected_reward"}
+
+
+def test_metrics_of_a_batch_are_those_of_its_first_step_but_for_the_divergence(script_modules):
+    is_far, of_batch = script_modules("utils").is_far, script_modules("utils").of_batch
+    of_steps = [
+        {"loss_actor": float(i), "kl_reference_policy": kl, "grad_norm": 7.0 + i}
+        for i, kl in enumerate((0.0, 0.1, 0.3))
+    ]
+    first = {"loss_actor": 0.0, "grad_norm": 7.0}
+    expected = {**first, "kl_reference_policy": 0.3, "gradient_steps": 3}
+    assert of_batch(of_steps) == expected
+    assert [is_far(of_steps, bound) for bound in (None, 0.3, 0.29)] == [False, False, True]
+    assert not is_far([{"kl_reference_policy": 9.0}], 0.0), "the first step is always made"
+    del of_steps[-1]["grad_norm"]  # it was too far
+    assert of_batch(of_steps) == {**expected, "gradient_steps": 2}
+
+
+def test_a_run_stops_once_it_holds_its_goal_and_is_finished(tmp_path):
+    free, stopped = tmp_path / "free", tmp_path / "stopped"
+    options = ("seed=1", "total_trajectories=200")
+    run_ecpo(tmp_path, *options, f"hydra.run.dir={free}")
+    metrics = read_metrics(free)
+
+    def batches_until(goal):
+        """Until it was held twice in a row, and how often it was held."""
+        is_held = [value >= goal for value in metrics["return"]]
+        pairs = [a and b for a, b in pairwise(is_held)]
+        last = pairs.index(True) + 2 if True in pairs else len(is_held)
+        return last, sum(is_held[:last])
+
+    # One that is held once before it is held twice.
+    goal = next(g for g in metrics["return"] if batches_until(g)[1] == 3)
+    last, _ = batches_until(goal)
+    assert last < len(metrics["step"])
+    goal = f"stop_when={{metric:return,at_least:{goal},batches:2}}"
+    run_ecpo(tmp_path, *options, goal, f"hydra.run.dir={stopped}")
+    before = read_metrics(stopped)
+    assert before == {name: column[:last] for name, column in metrics.items()}
+    run_ecpo(tmp_path, *options, goal, f"resume={stopped}")
+    assert read_metrics(stopped) == before
+    summary = json.loads((stopped / "summary.json").read_text())
+    assert (summary["finished"], summary["trajectories"]) == (True, 10 * last)
+
+
 @pytest.mark.slow  # each of the two processes imports torch
 def test_a_sweep_over_two_processes_gives_the_metrics_of_single_runs(sweep, tmp_path):
     run_ecpo(
@@ -99,6 +172,7 @@ def test_a_sweep_over_two_processes_gives_the_metrics_of_single_runs(sweep, tmp_
         "hydra/launcher=joblib",
         "hydra.launcher.n_jobs=2",
         "loss=ecpo,ment",
+        "form=paper",
         "seed=5",
         "project_steps=3",
         f"hydra.sweep.dir={tmp_path}",
@@ -124,6 +198,8 @@ def test_a_sweep_over_two_processes_gives_the_metrics_of_single_runs(sweep, tmp_
         (
             "env=reversed_addition",
             "loss=urex",
+            "form=paper",
+            "policy=lstm",
             "total_trajectories=40",
             "logger.backend=tensorboard",
         ),
@@ -134,6 +210,7 @@ def test_a_sweep_over_two_processes_gives_the_metrics_of_single_runs(sweep, tmp_
             "env.max_steps=5",
             "total_trajectories=64",
             "loss=ment",
+            "form=paper",
         ),
     ],
 )
@@ -175,7 +252,8 @@ def test_a_compiled_run_gives_the_metrics_of_a_run_that_is_not(tmp_path, env):
 
 @pytest.mark.slow  # two to five minutes
 def test_groups_of_eight_learn_cartpole(tmp_path):
-    run_ecpo(tmp_path, "env=gym", "seed=0", "evaluation_interval=10", f"hydra.run.dir={tmp_path}")
+    options = ("env=gym", "form=paper", "seed=0", "evaluation_interval=10")
+    run_ecpo(tmp_path, *options, f"hydra.run.dir={tmp_path}")
     returns = [value for value in read_metrics(tmp_path)["greedy_return"] if value == value]
     assert max(returns) >= 475, returns
 
@@ -183,7 +261,10 @@ def test_groups_of_eight_learn_cartpole(tmp_path):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["anneal_from={metric:foo,at_least:1}"], "anneal_from.metric must be one of"),
+        (
+            ["anneal_from={metric:foo,at_least:1}"],
+            "anneal_from.metric and stop_when.metric must be one of",
+        ),
         (["collector=multi_sync"], "num_groups=1 must be a multiple of the number of workers, 2"),
     ],
 )
@@ -193,10 +274,8 @@ def test_bad_options_end_with_a_clear_message(tmp_path, overrides, message):
     assert message in process.stderr
 
 
-def test_distinct_solutions_are_counted(monkeypatch):
-    monkeypatch.delitem(sys.modules, "tasks", raising=False)
-    monkeypatch.syspath_prepend(str(ECPO.parent))
-    tasks = importlib.import_module("tasks")
+def test_distinct_solutions_are_counted(script_modules):
+    tasks = script_modules("tasks")
     # (move, write, character) of two steps in each of four trajectories of two groups.
     one, other, silent = [[1, 1, 3], [1, 1, 2]], [[0, 1, 3], [1, 1, 2]], [[1, 0, 0], [1, 1, 2]]
     silent_again = [[1, 0, 4], [1, 1, 2]]  # the 4 is not written
@@ -215,8 +294,9 @@ def test_distinct_solutions_are_counted(monkeypatch):
         },
         batch_size=[2, 4, 2],
     )
+    assert tasks.is_solved(groups).tolist() == [[True, True, True, False], [True] * 4]
+    assert tasks.attained(groups) == (7 * 2 + 0.5) / 16
     # First group: one (twice) and other; second: one, silent (twice), and the short one.
     assert tasks.distinct_solutions(groups) == (2 + 3) / 2
     groups["next", "reward"].zero_()
     assert tasks.distinct_solutions(groups) == 0
-    sys.modules.pop("tasks")

@@ -25,11 +25,17 @@ from torchrl_ecpo.modules.histories import distinct_histories, hash_histories
 
 SCRIPT = Path(__file__).parents[1] / "sota-implementations/ecpo"
 MODULES = ("utils", "tasks", "stacked", "ecpo")
-BANDIT = ("env=bandit", "env.num_actions=50", "group_size=10", "total_trajectories=1000")
+BANDIT = ("env=bandit", "env.num_actions=50", "group_size=10", "total_trajectories=600")
 COPY = (
-    *("env=copy", "env.hidden_size=16", "num_groups=4", "group_size=5", "evaluation_interval=40"),
-    *("total_trajectories=2000", "optim.max_grad_norm=0.5", "project_steps=2"),
-    "anneal_from={metric:return,at_least:0.1}",
+    *("env=copy", "policy.hidden_size=16", "num_groups=4", "group_size=5", "project_steps=2"),
+    *("total_trajectories=600", "evaluation_interval=20", "optim.max_grad_norm=0.5"),
+    "anneal_from={metric:return,at_least:-0.12}",
+)
+PAPER = (*COPY, "form=paper")
+ANNEALED = (
+    *COPY,
+    "epochs=3",
+    "loss.tau_prime={schedule:linear,start:0.3,end:0,duration:4000}",
 )
 SEEDS = (3, 11)
 
@@ -83,24 +89,31 @@ def assert_same_curves(actual, expected):
 @pytest.mark.parametrize(
     "options",
     [
-        COPY,
-        pytest.param((*COPY, "env=reversed_addition", "loss=pmd_entropy"), marks=pytest.mark.slow),
+        ANNEALED,
+        (*COPY, "policy=window", "epochs=2"),
+        (*PAPER, "policy=lstm"),
+        pytest.param(
+            (*PAPER, "policy=lstm", "env=reversed_addition", "loss=pmd_entropy"),
+            marks=pytest.mark.slow,
+        ),
     ],
-    ids=["copy", "reversed_addition"],
+    ids=["memoryless", "window", "lstm", "reversed_addition"],
 )
 def test_stacked_runs_have_the_curves_of_single_ones(tmp_path, train, options):
     train(tmp_path / "stack", *options, f"seeds={[*SEEDS]}")
     for seed in SEEDS:
         single, stacked = tmp_path / str(seed), tmp_path / f"stack/seed_{seed}"
         train(single, *options, f"seed={seed}")
-        assert len(read_metrics(single)["step"]) == 100
+        metrics = read_metrics(single)
+        assert len(metrics["step"]) == 30
+        assert sum(x == x for x in metrics["pass_at_10"]) == 1
         assert_same_curves(stacked, single)
         # A directory like that of a single run, but for the checkpoints, which are the stack's.
         names = {path.name for path in single.iterdir()} - {"checkpoints"}
         assert {path.name for path in stacked.iterdir()} == names
         assert OmegaConf.load(stacked / "config.yaml") == OmegaConf.load(single / "config.yaml")
         assert json.loads((stacked / "summary.json").read_text())["finished"] is True
-    if options is COPY:
+    if options is ANNEALED:
         taus = [read_metrics(tmp_path / f"stack/seed_{seed}")["tau_prime"] for seed in SEEDS]
         assert taus[0][-1] != taus[1][-1], "each run begins to anneal when it has cracked the task"
 
@@ -108,13 +121,17 @@ def test_stacked_runs_have_the_curves_of_single_ones(tmp_path, train, options):
 SETTINGS = {
     "bandit": (BANDIT, ("loss=ecpo seed=3", "loss=urex loss.tau=0.2,0.5 seed=4")),
     "copy": (
-        COPY,
+        PAPER,
         (
             "loss=ecpo loss.tau=0.25,1.0 seed=3",
             "loss=urex seed=4 env.curriculum=group optim.lr=0.003 optim.amsgrad=false",
             "loss=ment seed=3 project_steps=1 anneal_from=null evaluation_interval=30",
             "loss=reps seed=4",
         ),
+    ),
+    "epochs": (
+        (*COPY, "total_trajectories=200"),
+        ("seed=3 epochs=5 max_kl=0.02", "seed=4 epochs=2", "loss=reps seed=3 epochs=3"),
     ),
 }
 RUNS = {
@@ -128,13 +145,13 @@ RUNS = {
         "loss=ecpo loss.tau=1.0 seed=3",
         *SETTINGS["copy"][1][1:],
     ),
+    "epochs": SETTINGS["epochs"][1],
 }
 
 
 @pytest.mark.parametrize("task", SETTINGS)
 def test_methods_and_settings_are_stacked(tmp_path, train, task):
     options, entries = SETTINGS[task]
-    options = (*options, "total_trajectories=600")
     train(tmp_path / "stack", *options, f"stack={[*entries]}")
     for index, own in enumerate(RUNS[task]):
         single, stacked = tmp_path / str(index), tmp_path / f"stack/run_{index}"
@@ -142,6 +159,36 @@ def test_methods_and_settings_are_stacked(tmp_path, train, task):
         assert_same_curves(stacked, single)
         assert OmegaConf.load(stacked / "config.yaml") == OmegaConf.load(single / "config.yaml")
     assert len(list((tmp_path / "stack").glob("run_*"))) == len(RUNS[task])
+    if task == "epochs":
+        steps = [read_metrics(tmp_path / f"stack/run_{i}")["gradient_steps"] for i in range(3)]
+        assert len({*steps[0]}) > 1, "some batches are left early"
+        assert [{*each} for each in steps[1:]] == [{2}, {3}]
+
+
+def ends(directory):
+    """The last step of each run, by its directory, and whether it says that it is finished."""
+    runs = sorted(path.parent for path in directory.glob("**/summary.json"))
+    assert all(json.loads((run / "summary.json").read_text())["finished"] for run in runs)
+    return {run.name: read_metrics(run)["step"][-1] for run in runs}
+
+
+GOAL = "stop_when={metric:expected_reward,at_least:0.6,batches:3}"
+
+
+def test_a_stack_stops_when_all_its_runs_hold_their_goals(tmp_path, train):
+    """Those that hold theirs go on until the last one does; for good, also when resumed."""
+    for seed in SEEDS:
+        train(tmp_path / f"seed_{seed}", *BANDIT, GOAL, f"seed={seed}")
+    alone = {f"seed_{seed}": ends(tmp_path / f"seed_{seed}")[f"seed_{seed}"] for seed in SEEDS}
+    first, last = sorted(alone.values())
+    assert first < last < 600
+    stack = tmp_path / "stack"
+    train(stack, *BANDIT, GOAL, f"seeds={[*SEEDS]}")
+    assert ends(stack) == dict.fromkeys(alone, last)
+    train(stack, *BANDIT, GOAL, f"seeds={[*SEEDS]}", f"resume={stack}")
+    assert ends(stack) == dict.fromkeys(alone, last)
+    train(tmp_path / "some", *BANDIT, GOAL, f"stack=['seed={SEEDS[0]}','seed=1 stop_when=null']")
+    assert {*ends(tmp_path / "some").values()} == {600}, "a run without a goal needs all"
 
 
 STACK = "stack=['loss=ecpo seed=1','loss=reps seed=2 project_steps=1']"
@@ -184,7 +231,7 @@ def test_what_is_no_list_of_runs_is_refused(script, name, given):
         (["stack=['seed=0','project_steps=3']"], "have 100 and 300 trajectories: .* end together"),
         (["env=gym", "seeds=[0,1]"], r"got env\.kind='gym'.*--multirun"),
         (["collector=multi_sync", "seeds=[0,1]"], r"collector=single, got .*'process'"),
-        (["env=copy", "env.distinct_histories=false", "seeds=[0,1]"], "distinct_histories=true"),
+        (["env=copy", "stack=['policy=lstm','seed=1']"], "must agree in policy.name, got lstm and"),
     ],
 )
 def test_what_cannot_be_stacked_is_refused_before_a_directory_is_made(
@@ -193,6 +240,15 @@ def test_what_cannot_be_stacked_is_refused_before_a_directory_is_made(
     with pytest.raises((ValueError, HydraException), match=message):
         train(tmp_path, *options)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_goal_is_held_in_so_many_batches_in_a_row_and_then_for_good(script):
+    goal = OmegaConf.create({"metric": "return", "at_least": 1.0, "batches": 2})
+    so_far, found = 0, []
+    for value in (1.0, 0.9, 1.0, 1.1, 0.0, 1.0):
+        so_far = script("utils").held(goal, so_far, {"return": value})
+        found.append(so_far)
+    assert found == [1, 0, 1, 2, 2, 2]
 
 
 def test_a_run_that_breaks_is_named(tmp_path, train, monkeypatch):

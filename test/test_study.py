@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 import yaml
 from matplotlib.image import imread
+from omegaconf import OmegaConf
 from rliable.metrics import probability_of_improvement
 
 from torchrl_ecpo.experiment import options
@@ -124,10 +125,12 @@ def test_the_study_is_what_was_planned(study):
         name: sum(len(cell.seeds) for cell in manifest.cells(entry))
         for name, entry in manifest.studies.items()
     }
-    assert runs["figure1"] == 6 * 3 * 25
+    assert runs["first_bandit"] == 3 * 25
+    assert runs["first_tasks"] == 5 * 3 * 25
     assert runs["figure2"] == 5 * 4 * 3
     assert runs["figure3_left"] == 2 * 5 * 10
-    reported = {s for name in ("figure1", "figure2") for s in manifest.studies[name].seeds}
+    names = ("first_bandit", "first_tasks", "figure2")
+    reported = {seed for name in names for seed in manifest.studies[name].seeds}
     searches = {n: entry for n, entry in manifest.studies.items() if n.startswith("search")}
     assert len(searches) == 15
     for name, search in searches.items():
@@ -149,6 +152,20 @@ def test_an_option_that_is_gone_or_new_makes_no_other_run_unless_it_has_another_
     assert changed({"env.head": "joint"}, {}) == ["env.head was joint, is masked"]
     assert changed({"tau": 1}, {"loss.score": "return", "tau": 1}) == []
     assert changed({}, {"loss.score": "batch"}) == ["loss.score was return, is batch"]
+    new = {"epochs": 1, "max_kl": "None", "policy.name": "lstm", "loss.entropy": "nats"}
+    assert changed({"env.hidden_size": 128, "env.distinct_histories": True}, new) == []
+    new = {"epochs": 10, "policy.name": "memoryless"}
+    changes = ["epochs was 1, is 10", "policy.name was lstm, is memoryless"]
+    assert sorted(changed({}, new)) == changes
+    assert changed({"stop_when.at_least": 25}, {"stop_when": "None"}) == []
+
+
+def test_what_determines_no_number_of_a_run_is_not_its_identity(study):
+    goal = {"metric": "return", "at_least": 25, "batches": 20}
+    config = {"total_trajectories": 9, "epochs": 2, "seed": 1, "threads": 1}
+    for stop_when in (None, goal):
+        whole = OmegaConf.create({**config, "stop_when": stop_when})
+        assert study.manifest.identity(whole) == {"epochs": 2, "seed": 1}
 
 
 @pytest.mark.slow
@@ -450,6 +467,42 @@ def test_runs_are_told_by_their_configuration_wherever_they_are(
     assert len(results.runs) == 4
 
 
+@pytest.mark.parametrize("has_goal", [True, False])
+def test_a_run_that_stopped_early_is_whole(study, tmp_path, counter, has_goal):
+    """It holds until the end what it held when it stopped; without a goal it is a part of a run."""
+    path = plan(tmp_path, counter, s={"steps": 200, "seeds": "1"})
+    (cell,) = study.manifest.read_manifests([path]).select()
+    directory = tmp_path / "runs/by_hand"
+    directory.mkdir(parents=True)
+    config = {**cell.config, "seed": 1, "total_frames": 200}
+    config["stop_when"] = {"metric": "return", "at_least": 3.0, "batches": 1} if has_goal else None
+    OmegaConf.save(config, directory / "config.yaml")
+    rows = [(step, min(step, 4), 7 if step < 99 else "nan") for step in range(1, 101)]
+    lines = ["step,return,entropy", *(",".join(map(str, row)) for row in rows)]
+    (directory / "metrics.csv").write_text("\n".join(lines) + "\n")
+    (directory / "summary.json").write_text('{"finished": true, "frames": 100}')
+    record = study.records.Record(directory)
+    assert (record.finished, record.stopped_at, record.reached) == (
+        (True, 100, 200) if has_goal else (False, None, 100)
+    )
+    results = study.results.Results(tmp_path / "results/study/s")
+    assert results.add(cell, record, ["return", "entropy"])
+    results.write()
+    results = study.results.Results.read(results.directory)
+    assert results.has(cell, 1) is has_goal
+    row, curve = results.runs["one", "A", "", 1], results.curves["one", "A", "", 1]
+    assert row["reached"] == ("200" if has_goal else "100")
+    assert row["stopped_at"] == ("100" if has_goal else "")
+    assert [point["step"] for point in curve] == [*range(2, 201 if has_goal else 101, 2)]
+    assert curve[:2] == [
+        {"step": 2, "return": 1.5, "entropy": 7},
+        {"step": 4, "return": 3.5, "entropy": 7},
+    ]
+    for point in curve[50:]:
+        assert point == {"step": point["step"], "return": 4, "entropy": 7}
+    assert not results.add(cell, record, ["return", "entropy"]), "it is there"
+
+
 def test_results_stay_unless_a_run_went_further_or_the_cell_has_changed(
     study, run, tmp_path, counter, capfd
 ):
@@ -562,6 +615,7 @@ def synthetic(study, tmp_path, counter, curves, steps=100, **entries):
                 metrics={"step": at, "return": slope * at / steps},
                 unit="frames",
                 finished=True,
+                stopped_at=None,
                 seconds=90,
                 versions={"torch": "2"},
             )

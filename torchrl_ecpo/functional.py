@@ -66,6 +66,7 @@ __all__ = [
     "lifted_log_weights",
     "log_mean_exp",
     "masked_mean",
+    "matched_temperature",
     "mean_seeking_projection",
     "ment_surrogate",
     "mode_seeking_projection",
@@ -110,8 +111,11 @@ class _Where(TypedDict):
 
 def _check_samples(
     sample_dim: int | None = None, mask: Tensor | None = None, **values: Tensor | float | None
-) -> None:
-    """Refuse what is no tensor of real numbers, and shapes that none of the tensors has alone."""
+) -> torch.Size:
+    """Refuse what is no tensor of real numbers, and shapes that none of the tensors has alone.
+
+    Returns that one.
+    """
     tensors: dict[str, Tensor] = {}
     for name, value in values.items():
         if isinstance(value, Tensor) and (value.is_floating_point() or _is_score(name, value)):
@@ -132,6 +136,7 @@ def _check_samples(
             f"sample_dim must be an axis of {', '.join(tensors)}, which have the shape "
             f"{tuple(shape)}, got {sample_dim!r}."
         )
+    return shape
 
 
 def _whole(shapes: Sequence[torch.Size]) -> torch.Size | None:
@@ -1082,34 +1087,37 @@ def standardised_in_batch(
 
 
 def matched_temperature(
-    tau_prime: Tensor, score: Tensor, log_prob: Tensor, *, mask: Tensor | None = None
+    tau_prime: float | Tensor,
+    score: Tensor,
+    reference_log_prob: Tensor,
+    *,
+    mask: Tensor | None = None,
 ) -> Tensor:
     r"""The tau' at which the entropy term of a lift spreads `tau_prime` times as far as the scores.
 
-    .. math:: \tau' \frac{\sqrt{\sigma_r^2 + 1/G}}{\max(\sigma_{\log\pi}, 1)}
+    .. math:: \tau' \frac{\sqrt{\sigma_r^2 + 1/G}}{\max(\sigma_{\log\bar\pi}, 1)}
 
     with deviations within the G groups, pooled over them. That of the log-probabilities grows with
     the trajectories' length, and falls with the entropy. 1/G: as if one more group had scores of
     unit deviation, so that the entropy counts where all scores are equal.
 
     Args:
-        tau_prime: 0-d.
         score: ``[E*, K]``, of unit deviation within their group or in the batch.
-        log_prob: ``[E*, K]``, under the reference.
-        mask: ``[E*, K]``, False where there is no trajectory.
 
     Returns:
-        0-d, detached.
+        0-d.
 
     Examples:
         Scores of deviation 1, surprise of deviation 2, a single group:
 
         >>> score, log_prob = torch.tensor([[-1.0, 1.0]]), torch.tensor([[-5.0, -1.0]])
-        >>> matched_temperature(torch.tensor(0.2), score, log_prob) * 2 / math.sqrt(2)
+        >>> matched_temperature(0.2, score, log_prob) * 2 / math.sqrt(2)
         tensor(0.2000)
     """
-    of_score, of_log_prob = (_pooled_variance(x, mask) for x in (score, log_prob))
-    num_groups = score.shape[:-1].numel()
+    check_temperatures(tau_prime=tau_prime, allow_zero=True)
+    given = {"score": score, "reference_log_prob": reference_log_prob, "tau_prime": tau_prime}
+    num_groups = _check_samples(mask=mask, **given)[:-1].numel()
+    of_score, of_log_prob = (_pooled_variance(x, mask) for x in (score, reference_log_prob))
     return tau_prime * ((of_score + 1 / num_groups) / of_log_prob.clamp_min(1)).sqrt()
 
 

@@ -44,6 +44,11 @@ def check_config(config: DictConfig) -> None:
             f"{config.env.kind!r}, whose policy computes each distinct history once: how much that "
             "is differs from batch to batch. Leave out compile."
         )
+    if "policy" in config and config.env.kind != "algorithmic":
+        raise ValueError(
+            f"policy= is for the algorithmic tasks, got env.kind={config.env.kind!r}, which has a "
+            "policy of its own. Leave out policy."
+        )
 
 
 def make_run(config: DictConfig, task: Task, **options: Any) -> Run:

@@ -154,7 +154,7 @@ def extended(points: Sequence[Point], steps: int) -> list[Point]:
         >>> extended([{"step": 198, "return": 5.0}], steps=200)
         [{'step': 198, 'return': 5.0}, {'step': 200, 'return': 5.0}]
     """
-    last = {name: next(p[name] for p in reversed(points) if name in p) for name in points[-1]}
+    last = {name: value for point in points for name, value in point.items()}
     ends = [round(part * steps / POINTS) for part in range(1, POINTS + 1)]
     return [*points, *({**last, "step": end} for end in ends if end > last["step"])]
 

@@ -15,7 +15,7 @@ from torchrl_ecpo import REPSLoss, TrustPCLLoss
 OPTIONS = (
     *("tau", "tau_prime", "delay_actor", "reduction", "control_variate", "epsilon", "normaliser"),
     *("clip_epsilon", "score", "aggregation", "ratio", "kl_to_ref_coeff", "length_norm"),
-    *("gamma", "n_steps"),
+    *("gamma", "n_steps", "entropy"),
 )
 NETWORKS = ("actor_network", "value_network")
 SHAPE = (2, 3, 4)
@@ -57,7 +57,7 @@ def subject(name, kind):
     if name in (*DELAYED, "reps"):
         options["delay_actor"] = False
     if name in ("ecpo", "reps"):
-        options["control_variate"] = False
+        options |= {"control_variate": False, "entropy": "nats"}
     if name == "trust_pcl":
         options |= {"delay_actor": False, "gamma": 0.9, "n_steps": 2}
         del options["score"]  # it is of rewards, not of returns

@@ -114,6 +114,19 @@ def test_rows_of_logits_are_as_good_as_gathered_logits(shape: tuple[int, ...]) -
     assert_same(ours, plain)  # still
 
 
+def test_places_are_those_of_any_logits_of_the_same_rows() -> None:
+    rows, actions = torch.tensor([[0, 2, 2], [4, 0, 2]]), ACTIONS.view(-1, 1, 1, 3)
+    table = random_dist(5).logits
+    places = TupleCategorical(table, NVEC, rows=rows).places(actions)
+    assert len(places.unique()) == 3 * len(ACTIONS)
+    other = table.flip(-1).requires_grad_()
+    ours = TupleCategorical(other, NVEC).log_prob_at(places)
+    plain = TupleCategorical(other[rows], NVEC).log_prob(actions)
+    assert_close(ours, plain, rtol=0, atol=0)
+    gradients = (torch.autograd.grad(x.sin().sum(), other)[0] for x in (ours, plain))
+    assert_close(*gradients)
+
+
 def test_rows_of_logits_gradients() -> None:
     gradients = []
     rows = torch.tensor([[0, 2, 2], [4, 0, 2]])  # 1 and 3 do not occur

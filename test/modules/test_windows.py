@@ -84,6 +84,18 @@ def test_recurrent_mode_equals_the_dense_network(window: int, is_tabular: bool) 
         assert_close(ours, plain, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("window", [1, 3])
+def test_pasts_are_read_out_by_the_weights_of_then(window: int, is_tabular: bool) -> None:
+    network, data = make_network(window), sequences()
+    with set_recurrent_mode(True):
+        pasts = network.read(data).pasts
+        for parameter in network.parameters():
+            parameter.data.mul_(1.5)
+        expected = network.read(data).output
+    assert pasts is not None
+    assert_close(network.read_out(pasts), expected)
+
+
 def test_gradients(is_tabular: bool) -> None:
     network, data = make_network(2), sequences()[:3, :3]
     names = [name for name, _ in network.named_parameters()]

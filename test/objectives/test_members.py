@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
 
@@ -12,6 +13,7 @@ from torchrl.objectives import HardUpdate
 from trajectory_problems import (
     CASES,
     DELAYED,
+    MASK,
     expected_losses,
     gradients,
     make_actor,
@@ -126,6 +128,64 @@ def test_unknown_scores_are_refused(loss_class):
 
 
 # -------------------------------------------------------------------------------------------- ECPO
+
+
+@pytest.mark.parametrize("masked", [False, True], ids=["whole", "masked"])
+@pytest.mark.parametrize(
+    ("score", "of_scores", "tau_prime"),
+    [("group", 1.0, 0.2), ("batch", math.sqrt(2), 0.2 * math.sqrt(1.5))],
+)
+def test_matched_entropy_by_hand(score, of_scores, tau_prime, masked):
+    """Two groups of two: scores of mean square 1/2 or 1, and 1/2 for G = 2; surprise of 4."""
+    actor = make_actor()
+    batch = sample(actor, 2, 2, 4)
+    surprise = torch.tensor([[5.0, 1.0], [6.0, 2.0]]).double()
+    batch["action_log_prob"] = -surprise.unsqueeze(-1).expand(2, 2, 4) / 4
+    batch["next", "reward"].zero_()
+    batch["next", "reward"][0, 1, 2] = 7.0
+    scores = torch.tensor([[-of_scores, of_scores], [0.0, 0.0]]).double()
+    log_prob = torch.stack([numbers(actor, group).log_prob for group in split(batch)])
+    weights = ((scores + tau_prime * surprise) / (0.8 + tau_prime)).softmax(-1)
+    if masked:
+        batch = torch.cat([batch, batch[:, :1]], 1)
+        mask = torch.tensor([True, True, False]).view(1, 3, 1).expand(2, 3, 4)
+        batch["next", "reward"][:, 2] = torch.nan
+        batch["action_log_prob"] = batch["action_log_prob"].where(mask, torch.nan)
+        batch[MASK] = mask
+    loss = ECPOLoss(actor, tau=0.8, tau_prime=0.4, entropy="matched", score=score).double()
+    loss.tau, loss.tau_prime = 0.8, 0.4
+    out = loss(batch)
+    expected = -(weights * log_prob).sum(-1).mean()
+    assert_close(out["loss_actor"], expected)
+    assert_close(gradients(out["loss_actor"], actor), gradients(expected, actor))
+    assert_close(out["max_weight"], weights.amax(-1).mean())
+
+
+def test_reps_matches_the_entropy_as_ecpo_does():
+    actor = make_actor()
+    batch = pad(sample(actor, 5, 6, 4))
+    options = {"entropy": "matched", "score": "group", "tau_prime": 0.3}
+    names = ("loss_actor", "ESS", "max_weight")
+    nats, out, ecpo = (
+        loss.double()(batch).select(*names)
+        for loss in (
+            REPSLoss(actor, **options | {"entropy": "nats"}),
+            REPSLoss(actor, **options),
+            ECPOLoss(actor, tau=1.0, **options),
+        )
+    )
+    assert_close(out, ecpo)
+    assert (out["ESS"] - nats["ESS"]).abs() > 1e-3
+
+
+@pytest.mark.parametrize("loss_class", [ECPOLoss, REPSLoss])
+def test_returns_have_no_deviation_to_match(loss_class):
+    with pytest.raises(ValueError, match=r"entropy='matched' needs .*'group' or 'batch', got"):
+        loss_class(make_actor(), entropy="matched")
+    with pytest.raises(
+        ValueError, match=r"entropy must be one of \('nats', 'matched'\), got 'foo'"
+    ):
+        loss_class(make_actor(), entropy="foo")
 
 
 def test_weights_stay_while_the_policy_is_projected():

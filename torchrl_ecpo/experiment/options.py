@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import operator
+import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext
 from difflib import SequenceMatcher
@@ -51,7 +52,9 @@ def check_command_line(script: str, check: Callable[[DictConfig, Sequence[str]],
             for run in expand(options):
                 check(compose_options(folder, run, flags.config_name or "config"), run)
     except (ValueError, HydraException, OmegaConfBaseException) as error:
-        raise SystemExit(f"{Path(script).name}: {error}") from None
+        # Of hydra's lines without where it looked, and its advice to add a group.
+        message = re.split(r"\n(?:Config search path|To append)", str(error))[0]
+        raise SystemExit(f"{Path(script).name}: {' '.join(message.split())}") from None
 
 
 def _initialized(config: Path) -> Any:

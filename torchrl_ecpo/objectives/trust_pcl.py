@@ -88,6 +88,7 @@ class TrustPCLLoss(LiftProjectLoss):
 
     losses = ("loss_value",)
     metrics = ("state_value",)
+    reads_steps = True
 
     @dataclass
     class _AcceptedKeys(LiftProjectLoss._AcceptedKeys):
