@@ -24,11 +24,16 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 install: $(VENV)/.installed ## make .venv with everything that is tested
 
-demo: install ## compare ECPO, UREX and MENT on the 10,000-armed bandit, then train ECPO on Copy
-	$(RUN) sota-implementations/ecpo/ecpo.py --multirun env=bandit loss=ecpo,urex,ment seed=1,2,3 \
-		hydra.sweep.dir=runs/demo/bandit
-	$(RUN) sota-implementations/ecpo/ecpo.py env=copy loss=ecpo seed=1 total_trajectories=80000 \
-		hydra.run.dir=runs/demo/copy
+DEMO := 'stack=["loss=ecpo seed=1,2,3","loss=urex loss.tau=0.5 loss.score=batch epochs=4 seed=1,2,3",$\
+	"loss=dr_grpo loss.clip_epsilon=0.15 loss.score=batch epochs=4 seed=1,2,3"]'
+
+demo: install ## compare ECPO, UREX and Dr.GRPO on Reverse, and ECPO, UREX and MENT on the 10,000-armed bandit
+	$(RUN) sota-implementations/ecpo/ecpo.py env=reverse $(DEMO) total_trajectories=56000 \
+		hydra.run.dir=runs/demo/reverse
+	$(RUN) sota-implementations/ecpo/ecpo.py env=bandit \
+		'stack=["loss=ecpo,urex,ment seed=1,2,3"]' hydra.run.dir=runs/demo/bandit
+	@$(RUN) -m torchrl_ecpo.experiment.compare runs/demo/reverse --metric return \
+		--title "Reverse" --x-label "trajectories"
 	@$(RUN) -m torchrl_ecpo.experiment.compare runs/demo/bandit --metric expected_reward \
 		--title "10,000-armed bandit" --x-label "sampled actions"
 

@@ -231,6 +231,26 @@ def scores_table(cells: Sequence[CellResult]) -> str:
     return table(("task", "method", *SCORES)[:width], [row[:width] for row in rows])
 
 
+def solved_table(study: Study, cells: Sequence[CellResult]) -> str:
+    """How many runs of each method solve each task, and the median of trajectories they need."""
+    by_task: dict[str, dict[str, str]] = {}
+    for r in cells:
+        if r.scored is not None and r.cell.task.solved is not None:
+            needed = steps_to_solve(*r.scored, r.cell.task.solved)
+            solved = np.isfinite(needed)
+            text = f"{solved.sum()} of {len(needed)}"
+            median = f", {np.median(needed[solved]):,.0f}" if solved.any() else ""
+            by_task.setdefault(r.title, {})[r.cell.method] = text + median
+    methods = [name for name in study.methods if any(name in row for row in by_task.values())]
+    if len(methods) < 4:  # few enough for the table of scores
+        return ""
+    rows = [[title, *(row.get(m, "") for m in methods)] for title, row in by_task.items()]
+    return (
+        "Runs that solve the task, and the median of the trajectories that these need:\n\n"
+        + table(("task", *methods), rows)
+    )
+
+
 def scores(count: str, curve: Curve, threshold: float | None) -> list[str]:
     """What the columns `SCORES` say of some runs."""
     cells = [count, with_error(area(*curve)), with_error(final(*curve))]
@@ -457,6 +477,7 @@ def section(study: Study, cells: Sequence[CellResult], docs: Path) -> str:
     if study.kind == "curves":
         parts = [
             curves_figure(study, cells, docs),
+            solved_table(study, cells),
             scores_table(cells),
             comparisons(study, cells),
             aggregates(study, cells),
