@@ -139,7 +139,7 @@ class Evaluation(nn.Module):
     def __init__(self, name: str, actor: ProbabilisticTensorDictSequential, seed: int) -> None:
         super().__init__()
         half, ten = EVALUATION_EPISODES, 10
-        # A level for each row, which `_set_level` sets.
+        # A level for each row.
         self.greedy = AlgorithmicEnv(name, num_groups=2 * half, curriculum="group")
         self.groups = AlgorithmicEnv(name, num_groups=half // ten, group_size=ten, curriculum=None)
         self._env = [TransformedEnv(self.greedy, get_env_transforms_from_module(actor))]
