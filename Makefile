@@ -25,7 +25,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 install: $(VENV)/.installed ## make .venv with everything that is tested
 
 demo: install ## compare ECPO, UREX and MENT on the 10,000-armed bandit, then train ECPO on Copy
-	$(RUN) sota-implementations/ecpo/ecpo.py --multirun env=bandit loss=ecpo,urex,ment seed=1,2,3 \
+	$(RUN) sota-implementations/ecpo/ecpo.py --multirun env=bandit loss=ecpo,urex,ment form=paper seed=1,2,3 \
 		hydra.sweep.dir=runs/demo/bandit
 	$(RUN) sota-implementations/ecpo/ecpo.py env=copy loss=ecpo seed=1 total_trajectories=80000 \
 		hydra.run.dir=runs/demo/copy
