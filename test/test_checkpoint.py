@@ -210,7 +210,11 @@ def change_record(directory):
         (make_foreign, (), "checkpoint-0*20 is no checkpoint of a run of this script"),
         (cut_record, (), "metrics.csv does not reach to step 20"),
         (change_record, (), "metrics.csv does not reach to step 20, .* with the rows that were"),
-        (None, ("loss.tau=1", "seed=7"), "loss.tau was [0-9.]+, is 1; seed was 0, is 7. Resume with"),
+        (
+            None,
+            ("loss.tau=1", "seed=7"),
+            "loss.tau was [0-9.]+, is 1; seed was 0, is 7. Resume with",
+        ),
         (None, ("resume=elsewhere",), "resume=elsewhere is not this run's directory"),
     ],
 )
