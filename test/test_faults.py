@@ -39,7 +39,7 @@ CONTROL = (
 RUNS = {
     "bandit": ("ecpo", "env.num_actions=100", "group_size=10", "total_trajectories=2000"),
     "copy": (
-        *("ecpo", "env=copy", "env.hidden_size=8", "num_groups=2", "group_size=5"),
+        *("ecpo", "env=copy", "policy.hidden_size=8", "num_groups=2", "group_size=5"),
         *("project_steps=2", "total_trajectories=2000", "evaluation_interval=20"),
     ),
     "pendulum": (*CONTROL, "env=pendulum", "total_frames=800"),

@@ -82,7 +82,8 @@ def evaluate(loss_class, options, batch):
     actor.scale.data.fill_(1.1)
     out = loss(batch)
     names = ("loss_actor", *loss.losses)
-    slopes = torch.autograd.grad(sum(out[name] for name in names), [*loss.parameters()])
+    total = torch.stack([out[name] for name in names]).sum()
+    slopes = torch.autograd.grad(total, [*loss.parameters()])
     return loss, out.detach(), slopes
 
 
