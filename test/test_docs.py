@@ -39,7 +39,9 @@ ALGORITHMIC_TASKS = {
     "reversed_addition": "ReversedAddition",
 }
 # Second column of a table of defaults: the configurations that it speaks of. They are those of the
-# loss of that name, or else of the loss that the page is named after, or else of ECPO.
+# loss of that name, or else of the loss that the page is named after, or else of ECPO; in the first
+# study's form if the heading goes on with that.
+PAPER = ", `form=paper`"
 STATED_FOR = {
     "algorithmic tasks": (ECPO_CONFIG, ALGORITHMIC_TASKS),
     "bandit": (ECPO_CONFIG, ("bandit",)),
@@ -94,6 +96,11 @@ def commands(page: Path) -> list[tuple[Path, str]]:
 def composed(config_directory: Path, overrides: tuple[str, ...]) -> DictConfig:
     with initialize_config_dir(str(config_directory), version_base="1.3"):
         return compose("config", list(overrides))
+
+
+def of_paper(task: str) -> tuple[str, ...]:
+    """The options of the first study."""
+    return ("form=paper", *(["policy=lstm"] if task in ALGORITHMIC_TASKS else []))
 
 
 def compose_command(script: Path, options: str) -> None:
@@ -153,12 +160,13 @@ def test_stated_defaults_are_those_of_the_configuration(page):
     tables = DEFAULTS_TABLE.findall(page.read_text())
     assert tables, "there is no table of defaults"
     for heading, rows in tables:
-        directory, tasks = STATED_FOR[heading]
+        directory, tasks = STATED_FOR[heading.removesuffix(PAPER)]
         losses = {path.stem for path in (directory / "loss").glob("*.yaml")}
         named = (heading.lower().replace("-", "_"), page.stem, "ecpo")
         loss = next(name for name in named if name in losses)
         for (option, stated), task in product(DEFAULT.findall(rows), tasks):
-            config = composed(directory, (f"env={task}", f"loss={loss}"))
+            form = of_paper(task) if heading.endswith(PAPER) else ()
+            config = composed(directory, (f"env={task}", f"loss={loss}", *form))
             value = OmegaConf.select(config, option, throw_on_resolution_failure=True)
             value = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
             assert value == yaml.safe_load(stated), f"{option} with env={task}"
@@ -178,7 +186,7 @@ def test_the_settings_that_the_search_chose_are_those_of_the_configuration():
         }
         assert set(stated) == {"env.curriculum", "loss.tau"}
         for place, loss in enumerate(losses):
-            config = composed(ECPO_CONFIG, (f"env={task}", f"loss={loss}"))
+            config = composed(ECPO_CONFIG, (f"env={task}", f"loss={loss}", *of_paper(task)))
             for option, values in stated.items():
                 assert str(OmegaConf.select(config, option)) == values[place], (task, loss)
             asked = OmegaConf.from_dotlist(optimisers[config.env.curriculum].split())
