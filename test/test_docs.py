@@ -39,10 +39,10 @@ ALGORITHMIC_TASKS = {
     "reversed_addition": "ReversedAddition",
 }
 # Second column of a table of defaults: the configurations that it speaks of. They are those of the
-# loss of that name, or else of the loss that the page is named after, or else of ECPO; in the first
-# study's form if the heading goes on with that.
-PAPER = ", `form=paper`"
+# loss of that name, or else of the loss that the page is named after, or else of ECPO; of ecpo.py
+# with the form and policy of the first study, but for the recipe's own.
 STATED_FOR = {
+    "the recipe, algorithmic tasks": (ECPO_CONFIG, ALGORITHMIC_TASKS),
     "algorithmic tasks": (ECPO_CONFIG, ALGORITHMIC_TASKS),
     "bandit": (ECPO_CONFIG, ("bandit",)),
     "gymnasium": (ECPO_CONFIG, ("gym",)),
@@ -96,11 +96,6 @@ def commands(page: Path) -> list[tuple[Path, str]]:
 def composed(config_directory: Path, overrides: tuple[str, ...]) -> DictConfig:
     with initialize_config_dir(str(config_directory), version_base="1.3"):
         return compose("config", list(overrides))
-
-
-def of_paper(task: str) -> tuple[str, ...]:
-    """The options of the first study."""
-    return ("form=paper", *(["policy=lstm"] if task in ALGORITHMIC_TASKS else []))
 
 
 def compose_command(script: Path, options: str) -> None:
@@ -160,12 +155,14 @@ def test_stated_defaults_are_those_of_the_configuration(page):
     tables = DEFAULTS_TABLE.findall(page.read_text())
     assert tables, "there is no table of defaults"
     for heading, rows in tables:
-        directory, tasks = STATED_FOR[heading.removesuffix(PAPER)]
+        directory, tasks = STATED_FOR[heading]
         losses = {path.stem for path in (directory / "loss").glob("*.yaml")}
         named = (heading.lower().replace("-", "_"), page.stem, "ecpo")
         loss = next(name for name in named if name in losses)
+        is_paper = directory is ECPO_CONFIG and "recipe" not in heading
+        form = ("form=paper",) if is_paper else ()
+        form += ("policy=lstm",) if is_paper and "copy" in tasks else ()
         for (option, stated), task in product(DEFAULT.findall(rows), tasks):
-            form = of_paper(task) if heading.endswith(PAPER) else ()
             config = composed(directory, (f"env={task}", f"loss={loss}", *form))
             value = OmegaConf.select(config, option, throw_on_resolution_failure=True)
             value = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
@@ -186,7 +183,7 @@ def test_the_settings_that_the_search_chose_are_those_of_the_configuration():
         }
         assert set(stated) == {"env.curriculum", "loss.tau"}
         for place, loss in enumerate(losses):
-            config = composed(ECPO_CONFIG, (f"env={task}", f"loss={loss}", *of_paper(task)))
+            config = composed(ECPO_CONFIG, (f"env={task}", f"loss={loss}", "form=paper"))
             for option, values in stated.items():
                 assert str(OmegaConf.select(config, option)) == values[place], (task, loss)
             asked = OmegaConf.from_dotlist(optimisers[config.env.curriculum].split())
@@ -218,6 +215,6 @@ def test_the_page_of_equations_names_tests_that_exist():
 
 def test_a_wrong_option_is_noticed():
     script = ROOT / "sota-implementations/ecpo/ecpo.py"
-    compose_command(script, " --multirun loss=ecpo,ment seed='range(0,2)' # a comment")
+    compose_command(script, " --multirun form=paper loss=ecpo,ment seed='range(0,2)' # a comment")
     with pytest.raises(Exception, match="no_such_option"):
         compose_command(script, "env=copy loss.no_such_option=1")
