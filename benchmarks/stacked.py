@@ -42,9 +42,9 @@ from utils import (  # noqa: E402 # pyright: ignore[reportMissingImports]
 
 def compose_run(env: str, level: int | None, seed: int) -> Any:
     """The configuration of a run."""
-    options = [f"env={env}", f"seed={seed}"]
+    options = [f"env={env}", f"seed={seed}", "form=paper"]
     if level:
-        options.append("optim.lr=1e-9")
+        options += ["policy=lstm", "optim.lr=1e-9"]
     with initialize_config_dir(str(SCRIPT / "config"), version_base="1.3"):
         return compose("config", options)
 
