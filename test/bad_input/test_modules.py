@@ -17,6 +17,7 @@ from torchrl_ecpo.modules import (
     DistinctHistoryLSTM,
     DistinctWindowNetwork,
     LinearSoftmax,
+    OneHotLinear,
     SharedCategorical,
     TupleCategorical,
     make_deterministic_actor,
@@ -146,8 +147,9 @@ def make_lstm():
 
 
 def make_window():
+    layer = OneHotLinear((6, 3, 3, 6) * 2, 8)
     return DistinctWindowNetwork(
-        (6, 3, 3, 6), 8, window=2, in_keys=["observation", "previous_action"]
+        (6, 3, 3, 6), layer, window=2, in_keys=["observation", "previous_action"]
     )
 
 
@@ -268,14 +270,13 @@ SUBJECTS = {
         build(DistinctWindowNetwork, **STEP, **WINDOW),
         {
             "num_classes": (6, 3, 3, 6),
-            "hidden_size": 8,
+            "network": OneHotLinear((6, 3, 3, 6) * 2, 8),
             "window": 2,
-            "readout": torch.nn.Identity(),
             "in_keys": ["observation", "previous_action"],
             "out_key": "embed",
         },
         fine=NAMES,
-        optional=["hidden_size", "window", "readout", "out_key"],
+        optional=["window", "out_key"],
     ),
     "DistinctWindowNetwork.forward": Subject(read(make_window, (4,)), STEP | WINDOW, fine=CLASSES),
     "record_latents": Subject(latents, {"policy": SPEC}),

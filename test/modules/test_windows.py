@@ -15,7 +15,13 @@ from torchrl.modules import get_env_transforms_from_module, set_recurrent_mode
 from torchrl_ecpo import ECPOLoss
 from torchrl_ecpo.collectors import TrajectoryGroupCollector
 from torchrl_ecpo.envs import AlgorithmicEnv
-from torchrl_ecpo.modules import DistinctWindowNetwork, make_tuple_policy, windows
+from torchrl_ecpo.modules import (
+    DistinctWindowNetwork,
+    OneHotLinear,
+    TupleTables,
+    make_tuple_policy,
+    windows,
+)
 
 NUM_CLASSES = (3, 2)
 ROWS, STEPS = 8, 7
@@ -25,10 +31,17 @@ exactly = {"rtol": 0, "atol": 0}
 
 def make_network(window: int) -> DistinctWindowNetwork:
     torch.manual_seed(0)
-    readout = torch.nn.Sequential(torch.nn.Tanh(), torch.nn.Linear(5, 2, dtype=torch.float64))
-    return DistinctWindowNetwork(
-        NUM_CLASSES, 5, window, readout, in_keys=["inputs"], dtype=torch.float64
+    network = torch.nn.Sequential(
+        OneHotLinear(NUM_CLASSES * window, 5, dtype=torch.float64),
+        torch.nn.Tanh(),
+        torch.nn.Linear(5, 2, dtype=torch.float64),
     )
+    return DistinctWindowNetwork(NUM_CLASSES, network, window, in_keys=["inputs"])
+
+
+def dense_output(network: DistinctWindowNetwork, one_hots: torch.Tensor) -> torch.Tensor:
+    layers: Any = network.network
+    return layers[1:](F.linear(one_hots, layers[0].weight, layers[0].bias))
 
 
 @pytest.fixture(params=IS_TABULAR, ids=["unique", "tabular"])
@@ -68,11 +81,11 @@ def test_recurrent_mode_equals_the_dense_network(window: int, is_tabular: bool) 
     assert network.is_tabular == is_tabular
     inputs = dense_windows(data, window)
     rows: list[int] = []
-    network.readout.register_forward_hook(lambda module, args, out: rows.append(len(out)))
+    network.network.register_forward_hook(lambda module, args, out: rows.append(len(out)))
     with set_recurrent_mode(True):
         output = network(data.clone())["embed"]
     assert rows == [7**window if is_tabular else len(inputs.flatten(0, 1).unique(dim=0))]
-    expected = network.readout(network.layer(inputs))
+    expected = dense_output(network, inputs)
     assert_close(output, expected)
     weights = torch.randn(output.shape, dtype=output.dtype)
     parameters = list(network.parameters())
@@ -170,7 +183,9 @@ def test_constant_weights_change_no_number_and_are_forgotten(window: int | None)
     policy = copy_policy(window)
     expected = act(policy)
     rows: list[int] = []
-    policy.module[0].readout.register_forward_hook(lambda *args: rows.append(len(args[-1])))
+    core = policy.module[0]
+    last = core.readout if window is None else core.network
+    last.register_forward_hook(lambda *args: rows.append(len(args[-1])))
     with torch.no_grad(), policy.constant_weights():
         assert rows == ([6 * 3 * 3 * 6 + 1] if window == 1 else [])
         for _ in range(2):
@@ -243,3 +258,51 @@ def test_what_a_step_lacks_is_named() -> None:
         network(step.exclude("is_init"))
     with set_recurrent_mode(True), pytest.raises(ValueError, match="keep trajectories whole"):
         network(sequences()[:, 1:])
+
+
+def test_tables_add_their_rows_where_no_blank_is_seen() -> None:
+    torch.manual_seed(0)
+    blank, moves, characters = 3, 4, 3
+    network = TupleTables([blank + 1, moves + 1, 3, characters + 1], window=3, hidden_size=8)
+    for table in (network.characters, network.moves):
+        torch.nn.init.normal_(table)
+    sizes = torch.tensor([blank + 1, moves + 1, 3, characters])
+    seen = (torch.rand(200, 3, 4) * (sizes + 1)).long() - 1
+    seen[:, 0].clamp_(min=0)  # the present step is always there
+    logits = network(seen)
+    for row, own in zip(seen.tolist(), logits, strict=True):
+        expected = network.readout(network.hidden(torch.tensor([row[0]])).relu())[0]
+        observations = [step[0] for step in row]
+        written = next((character + 1 for _, _, write, character in row if write == 1), 0)
+        if blank not in observations:
+            place = written
+            for observation in observations:
+                place = place * (blank + 2) + observation + 1
+            added = network.CHARACTER_STEP * network.characters[place]
+            expected = torch.cat([expected[: moves + 2], expected[moves + 2 :] + added])
+        if observations[0] != blank:
+            added = network.MOVE_STEP * network.moves[(row[0][1] + 1) * (moves + 2) + row[1][1] + 1]
+            expected = torch.cat([expected[:moves] + added, expected[moves:]])
+        assert_close(own, expected)
+
+
+def test_tables_are_a_policy_without_memory_at_first_and_of_each_case_alone() -> None:
+    torch.manual_seed(0)
+    policy = make_tuple_policy(4, (4, 2, 3), window=4, tables=True, hidden_size=8)
+    network = policy.module[0].network
+    seen = torch.zeros(2, 4, 4, dtype=torch.int64)
+    seen[1, 3, 0] = 1  # another past, the same present
+    before = network(seen)
+    assert_close(before[0], before[1], **exactly)
+    before[0].sum().backward()
+    assert network.characters.grad.abs().sum(-1).count_nonzero() == 1
+    assert network.moves.grad.abs().sum(-1).count_nonzero() == 1
+    env = AlgorithmicEnv("reversed_addition", num_groups=2, group_size=3, seed=0)
+    collector = TrajectoryGroupCollector(env, policy, num_groups=2, group_size=3)
+    losses = ECPOLoss(policy)(collector.rollout())
+    assert losses["kl_reference_policy"].abs() < 1e-6
+
+
+def test_tables_need_a_past() -> None:
+    with pytest.raises(ValueError, match="window"):
+        make_tuple_policy(4, (4, 2, 3), window=1, tables=True)
