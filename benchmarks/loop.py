@@ -139,7 +139,7 @@ class DistinctNet:
     def step(self, symbol: Tensor, state: State | None) -> tuple[Tensor, State]:
         """Logits and state `[n, *]` of one step; without a state, the first."""
         starts = torch.full((1, len(symbol)), state is None)
-        nodes, logits, states = self.core.evaluate(symbol.unsqueeze(0), starts, states=state)
+        nodes, logits, states, _ = self.core.evaluate(symbol.unsqueeze(0), starts, states=state)
         h, c = (value.squeeze(1).index_select(0, nodes[0]) for value in states.values())
         return logits.index_select(0, nodes[0]), (h, c)
 
@@ -147,7 +147,7 @@ class DistinctNet:
         """Logits `[T, N, L]` of whole trajectories."""
         starts = ~steps.mask
         starts[0] = True
-        nodes, logits, _ = self.core.evaluate(steps.symbol, starts, steps.mask)
+        nodes, logits, *_ = self.core.evaluate(steps.symbol, starts, steps.mask)
         return logits.index_select(0, nodes.flatten()).view(*nodes.shape, -1)
 
 

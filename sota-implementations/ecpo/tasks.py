@@ -160,7 +160,7 @@ class Evaluation(nn.Module):
             env.curriculum.levels.fill_(level)
             env.curriculum.streaks.zero_()
         self.greedy.curriculum.levels[EVALUATION_EPISODES:] = LONG_LEVEL
-        played = _greedy(self._env[0], self._actor[0])
+        played: Any = _greedy(self._env[0], self._actor[0])
         episodes, long = played[:EVALUATION_EPISODES], played[EVALUATION_EPISODES:]
         collector = self._collector[0]
         collector.update_policy_weights_()

@@ -129,8 +129,9 @@ def make_temperatures(config: DictConfig, loss_module: TrajectoryGroupLoss) -> T
 
 def is_far(of_steps: Sequence[Metrics], max_kl: float | None) -> bool:
     """Whether the gradient steps on a batch have led further from the reference than they may."""
-    has_stepped = len(of_steps) > 1 and max_kl is not None
-    return has_stepped and bool(of_steps[-1]["kl_reference_policy"] > max_kl)
+    if max_kl is None or len(of_steps) < 2:
+        return False
+    return bool(of_steps[-1]["kl_reference_policy"] > max_kl)
 
 
 def of_batch(of_steps: Sequence[Metrics]) -> Metrics:

@@ -249,8 +249,8 @@ def _steps_of(study: Study, task: Task) -> int:
 
 
 def _seeds_of(plan: str | Mapping[str, Any]) -> tuple[int, ...]:
-    has_own = isinstance(plan, Mapping) and "seeds" in plan
-    return parse_seeds(plan["seeds"]) if has_own else ()
+    own = None if isinstance(plan, str) else plan.get("seeds")
+    return () if own is None else parse_seeds(own)
 
 
 def _settings(

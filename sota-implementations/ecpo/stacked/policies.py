@@ -162,7 +162,8 @@ class _StackedTuplePolicy(TuplePolicy, StackedPolicy):
             if pasts is None:
                 with set_recurrent_mode(True):
                     return self.read(steps)[0].log_prob_at(places)
-            return TupleCategorical(self.core.read_out(pasts), **self.options).log_prob_at(places)
+            core: Any = self.core
+            return TupleCategorical(core.read_out(pasts), **self.options).log_prob_at(places)
 
         return evaluate
 
