@@ -780,7 +780,7 @@ def test_in_the_first_study_ecpo_has_the_largest_areas(study, committed):
 def test_who_solves_what_is_as_the_report_has_it(page):
     of_study = (COMMITTED / "study.md").read_text()
     (table,) = re.findall(
-        r"^\| task \| ECPO \| UREX .*\n(?:\|.*\n)+", (ROOT / page).read_text(), re.M
+        r"^\| task \| ECPO \| UREX \| MENT \| Dr.*\n(?:\|.*\n)+", (ROOT / page).read_text(), re.M
     )
     for line in table.splitlines():
         assert line in of_study
