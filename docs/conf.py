@@ -50,7 +50,7 @@ nitpick_ignore_regex = [
         "Actions|Axes|CheckpointError|EnvBase|HydraException|NestedKey|Tensor|TensorDictBase",
     ),
     ("py:class", r"torchrl_ecpo\..*\._.+"),  # what is private has no page
-    ("py:class", r"torchrl_ecpo\.modules\.histories\..+"),  # nor has the search for histories
+    ("py:class", r"torchrl_ecpo\.modules\.(histories|distinct)\..+"),  # nor have distinct pasts
     ("py:attr", "in_keys|loss_mask_key|losses|metrics|out_keys"),  # of every loss
 ]
 

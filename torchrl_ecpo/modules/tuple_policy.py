@@ -306,7 +306,7 @@ class TupleTables(nn.Module):
     """
 
     CHARACTER_STEP, MOVE_STEP = 2.0, 4.0
-    """By how much a gradient step moves a table's row further than other parameters: Adam's steps
+    """By how much a gradient step moves a table's row further than other parameters. Adam's steps
     do not depend on the gradient's size, so that a factor on the table is one on its steps."""
 
     def __init__(

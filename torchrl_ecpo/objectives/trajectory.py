@@ -99,7 +99,7 @@ class TrajectoryGroups(NamedTuple):
     steps: Steps
     """What was summed, for losses of single steps."""
     scores: Tensor
-    """What is to be maximised: the returns, or what the loss's ``score`` makes of them."""
+    """What is to be maximised, the returns, or what the loss's ``score`` makes of them."""
 
     @property
     def num_steps(self) -> Tensor:
@@ -188,7 +188,7 @@ class TrajectoryGroupLoss(PolicyLoss):
     """
 
     reads_steps: bool = True
-    """Whether :meth:`surrogate` reads ``groups.steps`` or ``groups.num_steps``. Of a loss that does
+    """Whether ``surrogate`` reads ``groups.steps`` or ``groups.num_steps``. Of a loss that does
     not, the sums over a trajectory's steps may be handed in as a trajectory of one step."""
 
     further_in_keys: Sequence[NestedKey] = ()
