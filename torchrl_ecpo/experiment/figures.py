@@ -33,7 +33,7 @@ METHOD_COLOURS = {
     "td3": "#D55E00",
     "ddpg": "#CC79A7",
 }
-COLOURS = ("#CC79A7", "#E69F00", "#56B4E9", "#000000", "#0072B2", "#009E73", "#D55E00")
+COLOURS = ("#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999", "#0072B2", "#009E73", "#D55E00")
 Curves = Mapping[str, tuple[np.ndarray, np.ndarray]]
 """By method, the steps ``[n]`` and the values ``[runs, n]``."""
 
