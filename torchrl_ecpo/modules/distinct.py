@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, cast
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import TensorDictPrimer
 from torchrl.modules import recurrent_mode
@@ -23,7 +23,6 @@ from torchrl.modules import recurrent_mode
 from torchrl_ecpo.checks import (
     check_counts,
     check_keys,
-    check_kind,
     check_mask,
     names_entries,
 )
@@ -50,8 +49,7 @@ class DistinctCore(TensorDictModuleBase):
     """
 
     state_keys: Sequence[NestedKey] = ()
-    needs_starts = True
-    """Whether it reads `is_init`."""
+    """What travels from step to step; `is_init`, which says where it starts, is read with it."""
 
     def __init__(
         self,
@@ -69,7 +67,7 @@ class DistinctCore(TensorDictModuleBase):
                 f"{self.num_classes}."
             )
         self.input_keys = check_keys("in_keys", in_keys)
-        starts = ["is_init"] if self.needs_starts else []
+        starts = ["is_init"] if self.state_keys else []
         all_keys: list[Any] = [*self.input_keys, *self.state_keys, *starts]
         self.in_keys = all_keys
         out_keys: list[Any] = [*check_keys("out_key", [out_key])]
@@ -184,7 +182,7 @@ class DistinctCore(TensorDictModuleBase):
 
     def _starts(self, tensordict: TensorDictBase) -> Tensor:
         """Where sequences have no past, bool `[*B]`."""
-        if not self.needs_starts:
+        if not self.state_keys:
             return torch.ones(tensordict.shape, dtype=torch.bool, device=tensordict.device)
         is_init = tensordict.get("is_init", None)
         if is_init is None:
@@ -242,13 +240,6 @@ def radix(num_classes: tuple[int, ...], device: torch.device) -> tuple[Tensor, .
 def _time_first(x: Tensor | None) -> Any:
     """`[*B, T]` to `[T, N]`."""
     return None if x is None else x.reshape(-1, x.shape[-1]).t().contiguous()
-
-
-def as_readout(readout: nn.Module | None) -> nn.Module:
-    """What is applied to the output of each past, nothing for None."""
-    readout = nn.Identity() if readout is None else readout
-    check_kind("readout", readout, nn.Module)
-    return readout
 
 
 def take_rows(values: Tensor, index: Tensor) -> Tensor:

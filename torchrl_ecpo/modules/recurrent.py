@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.data import TensorSpec, Unbounded
 
-from torchrl_ecpo.checks import check_count
-from torchrl_ecpo.modules.distinct import DistinctCore, Evaluated, as_readout, radix
+from torchrl_ecpo.checks import check_count, check_kind
+from torchrl_ecpo.modules.distinct import DistinctCore, Evaluated, radix
 from torchrl_ecpo.modules.histories import (
     Histories,
     LSTMOverHistories,
@@ -99,7 +99,8 @@ class DistinctHistoryLSTM(DistinctCore):
         super().__init__(num_classes, in_keys=in_keys, out_key=out_key)
         self.hidden_size = check_count("hidden_size", hidden_size)
         self.cell = nn.LSTMCell(sum(self.num_classes), self.hidden_size, device=device, dtype=dtype)
-        self.readout = as_readout(readout)
+        self.readout = nn.Identity() if readout is None else readout
+        check_kind("readout", self.readout, nn.Module)
 
     def state_specs(self) -> dict[NestedKey, TensorSpec]:
         """H and c, `[1, H]` each."""

@@ -79,8 +79,7 @@ class DistinctWindowNetwork(DistinctCore):
         out_key: str = "embed",
     ) -> None:
         self.window = check_count("window", window)
-        self.needs_starts = self.window > 1
-        self.state_keys = [STATE_KEY] * self.needs_starts
+        self.state_keys = [STATE_KEY] if self.window > 1 else []
         super().__init__(num_classes, in_keys=in_keys, out_key=out_key)
         # The digits of a window's number are its symbols, 0 for none, the present one last.
         self.base = self.num_symbols + 1
