@@ -24,7 +24,7 @@ from torchrl_ecpo.modules import TupleCategorical, make_softmax_policy, make_tup
 from torchrl_ecpo.modules.histories import distinct_histories, hash_histories
 
 SCRIPT = Path(__file__).parents[1] / "sota-implementations/ecpo"
-MODULES = ("utils", "tasks", "stacked", "ecpo")
+MODULES = ("utils", "tasks", "stacked", "ecpo", "play")
 BANDIT = ("env=bandit", "env.num_actions=50", "group_size=10", "total_trajectories=600")
 COPY = (
     *("env=copy", "policy.hidden_size=16", "num_groups=4", "group_size=5", "project_steps=2"),
@@ -208,6 +208,49 @@ def test_a_resumed_stack_goes_on_as_if_never_stopped(tmp_path, train, options):
     for run in runs:
         resumed, whole = read_metrics(broken / run), read_metrics(tmp_path / "whole" / run)
         assert str(resumed) == str(whole)  # as text, in which NaN equals NaN
+
+
+@pytest.mark.parametrize(
+    ("runs", "directory"),
+    [((f"seeds={[*SEEDS]}",), "seed_11"), (("stack=['seed=3 epochs=2','seed=11']",), "run_1")],
+)
+def test_play_shows_a_run_as_it_was_trained(tmp_path, train, script, capsys, runs, directory):
+    options = (*COPY, "total_trajectories=200")
+    train(tmp_path / "alone", *options, f"seed={SEEDS[1]}")
+    train(tmp_path / "stack", *options, *runs)
+    shown = []
+    for run in (tmp_path / "alone", tmp_path / "stack" / directory):
+        capsys.readouterr()
+        script("play").main([str(run), "--level", "5", "--episodes", "3"])
+        shown.append(capsys.readouterr().out)
+    assert shown[0] == shown[1]
+    episodes = shown[0].strip().split("\n\n")
+    assert len(episodes) == 3
+    for episode in episodes:
+        head, *tracks = episode.splitlines()
+        reads, moves, writes = (track[8:] for track in tracks)
+        assert len(reads) == len(moves) >= len(writes)
+        # Copy's head moves along one row; what it read it can go back to.
+        place, tape = 0, {}
+        for character, move in zip(reads, moves, strict=True):
+            assert tape.setdefault(place, character) == character
+            place += {"<": -1, ">": 1}[move]
+        assert head.startswith("return ")
+        assert head.removesuffix(", solved").endswith((" of 5", " of 6", " of 7"))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ((), "No such file"),
+        (("--level", "0"), "--level must be"),
+        (("--episodes", "0"), "--episodes must be"),
+    ],
+)
+def test_play_refuses_what_it_cannot_show(tmp_path, script, capsys, options, message):
+    with pytest.raises(SystemExit):
+        script("play").main([str(tmp_path), *options])
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["seeds", "stack"])

@@ -160,7 +160,7 @@ class Evaluation(nn.Module):
             env.curriculum.levels.fill_(level)
             env.curriculum.streaks.zero_()
         self.greedy.curriculum.levels[EVALUATION_EPISODES:] = LONG_LEVEL
-        played: Any = _greedy(self._env[0], self._actor[0])
+        played: Any = greedy(self._env[0], self._actor[0])
         episodes, long = played[:EVALUATION_EPISODES], played[EVALUATION_EPISODES:]
         collector = self._collector[0]
         collector.update_policy_weights_()
@@ -205,7 +205,7 @@ def make_gym(config: DictConfig) -> Task:
         return {"length": groups["collector", "mask"].sum(-1).float().mean()}
 
     def evaluate(groups: TensorDictBase) -> Metrics:
-        return {"greedy_return": _returns(_greedy(evaluation_env, actor)).mean()}
+        return {"greedy_return": _returns(greedy(evaluation_env, actor)).mean()}
 
     shown = ("return", "greedy_return", "entropy", "ESS")
     return Task(env, make_env, actor, measure, evaluate, shown, copies)
@@ -240,7 +240,7 @@ def make_mlp_policy(env: EnvBase, hidden_sizes: Sequence[int]) -> ProbabilisticT
 
 
 @torch.no_grad()
-def _greedy(env: EnvBase, actor: ProbabilisticTensorDictSequential) -> TensorDictBase:
+def greedy(env: EnvBase, actor: ProbabilisticTensorDictSequential) -> TensorDictBase:
     """One whole episode in each row, with the most probable actions."""
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         return env.rollout(10_000, actor, break_when_any_done=False, break_when_all_done=True)

@@ -1,6 +1,6 @@
 """What every script needs and no loss knows: run directories, loggers, curves and figures."""
 
-from torchrl_ecpo.experiment.checkpoint import Checkpoints, Progress
+from torchrl_ecpo.experiment.checkpoint import Checkpoints, Progress, restore_part
 from torchrl_ecpo.experiment.compiling import compile_module
 from torchrl_ecpo.experiment.options import check_command_line, check_options, compose_options
 from torchrl_ecpo.experiment.run import MetricsTable, Run, read_metrics
@@ -15,4 +15,5 @@ __all__ = [
     "compile_module",
     "compose_options",
     "read_metrics",
+    "restore_part",
 ]

@@ -26,7 +26,7 @@ from torchrl_ecpo.checks import check_count
 from torchrl_ecpo.experiment._files import StateFile, check_files, read_manifest, seal
 from torchrl_ecpo.experiment.run import Run, differences, flatten
 
-__all__ = ["Checkpoints", "Progress"]
+__all__ = ["Checkpoints", "Progress", "restore_part"]
 
 FOLDER = "checkpoints"
 # A run that differs in these alone is the same run.
@@ -119,12 +119,7 @@ class Checkpoints:
     @property
     def latest(self) -> Path | None:
         """The last checkpoint, if there is one."""
-        return (self._paths() or [None])[-1]
-
-    def _paths(self) -> list[Path]:
-        """All checkpoints, the oldest first."""
-        paths = sorted(self.folder.glob("checkpoint-*"))
-        return [path for path in paths if re.fullmatch(r"checkpoint-\d+(-finished)?", path.name)]
+        return (_paths(self.folder) or [None])[-1]
 
     def _remove(self, paths: Sequence[Path] = ()) -> None:
         """Remove checkpoints, none of which is ever seen in part, and what a kill has left."""
@@ -153,7 +148,9 @@ class Checkpoints:
                 self.checkpoint.register(name, part, adapter=StateFile())
         check_count(f"progress.{run.unit}", self.step, least=0)
         if self.source is None:
-            self._remove(self._paths())  # of a run that was here before, whose record will be gone
+            self._remove(
+                _paths(self.folder)
+            )  # of a run that was here before, whose record will be gone
         else:
             self._load(self.source)
         self._saved_step = self.step if self.source is not None else None
@@ -223,7 +220,7 @@ class Checkpoints:
             )
             seal(written)
             written.rename(path)
-            self._remove(self._paths()[: -1 if finished else -self.options.keep])
+            self._remove(_paths(self.folder)[: -1 if finished else -self.options.keep])
         except (OSError, RuntimeError) as error:
             shutil.rmtree(written, ignore_errors=True)
             raise CheckpointError(
@@ -288,6 +285,37 @@ class Checkpoints:
                 self.save()
             except (FloatingPointError, CheckpointError) as refused:
                 print(refused, file=sys.stderr)
+
+
+def _paths(folder: Path) -> list[Path]:
+    """All checkpoints, the oldest first."""
+    paths = sorted(folder.glob("checkpoint-*"))
+    return [path for path in paths if re.fullmatch(r"checkpoint-\d+(-finished)?", path.name)]
+
+
+def restore_part(directory: Path, name: str, part: Any) -> dict[str, Any]:
+    """Put one part of a run, such as its loss module, where its last checkpoint has it.
+
+    Args:
+        directory: of the run.
+        name: of the part.
+        part: has ``load_state_dict()``.
+
+    Returns:
+        The configuration that the run was started with.
+
+    Raises:
+        CheckpointError: if there is no checkpoint, or none with that part, or if it is damaged.
+    """
+    found = _paths(directory / FOLDER)
+    if not found:
+        raise CheckpointError(f"{directory} has no checkpoint: is it the directory of a run?")
+    manifest = read_manifest(found[-1])
+    check_files(found[-1], manifest)
+    checkpoint = Checkpoint()
+    checkpoint.register(name, part, adapter=StateFile())
+    checkpoint.load(found[-1], components={name})
+    return manifest["metadata"]["config"]
 
 
 def run_directory(resume: str | None, parent: str, name: str) -> str:
