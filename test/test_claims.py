@@ -46,14 +46,14 @@ def test_a_claim_that_is_wrong_or_counts_wrongly_is_noticed(study):
     assert now("2 of 10", "1, 10") == "1 of 10"
     assert now("1,234 and -0.5", "[12345.6, [-0.04]]") == "12,346 and 0.0"
     assert now("TD3's 7 of pass@10", "8") == "TD3's 8 of pass@10"
-    for expression, message in (("1", "more numbers"), ("1, 2, 3", "lacks"), ("'a'", "convert")):
+    for expression, message in (("1", "more numbers"), ("1, 2, 3", "lacks")):
         with pytest.raises(ValueError, match=message):
             now("2 of 10", expression)
     with pytest.raises(ValueError, match="does not hold"):
         now("all of them", "1 > 2")
 
 
-# -------------------------------------------------- what results.md says of environments and policies
+# ------------------------------------------- what results.md says of environments and policies
 
 
 def test_an_ant_that_never_moves_has_990_to_1000():

@@ -14,7 +14,6 @@ import os
 import re
 import signal
 import time
-from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -704,19 +703,6 @@ def test_make_report_writes_the_committed_page_byte_for_byte(study, monkeypatch,
     assert_pictures_are_committed(tmp_path / "figures/study")
 
 
-@pytest.fixture(scope="module")
-def committed(study):
-    """Committed results of a study, by title of the task and method."""
-    manifest = study.manifest.read_manifests()
-
-    @lru_cache
-    def read(name):
-        cells = study.results.read_cells(manifest, manifest.studies[name])
-        return {(result.title, result.cell.method): result for result in cells}
-
-    return read
-
-
 STATED = re.compile(r"(-?[\d,.]+) ± ([\d,.]+)(?: \((.+)\))?")
 
 
@@ -728,11 +714,12 @@ STATED = re.compile(r"(-?[\d,.]+) ± ([\d,.]+)(?: \((.+)\))?")
         ("README.md", ("figure2",), r"task[^|]*(?:\| runs )?\| ECAC"),
     ],
 )
-def test_the_tables_of_results_state_what_is_committed(study, committed, page, names, heading):
+def test_the_tables_of_results_state_what_is_committed(study, page, names, heading):
     tables = re.findall(rf"^\| {heading}.*\n(?:\|.*\n)+", (ROOT / page).read_text(), re.M)
     (lines,) = ([line[2:-2].split(" | ") for line in table.splitlines()] for table in tables)
     header, _, *rows = lines
-    results = {key: result for name in names for key, result in committed(name).items()}
+    committed = [result for name in names for result in study.claims.committed(name).values()]
+    results = {(result.title, result.cell.method): result for result in committed}
     assert len(rows) == len({title for title, _ in results})
     assert {method for _, method in results} <= set(header)
     for row in rows:
@@ -759,12 +746,6 @@ def assert_stated(study, result, stated):
         assert brackets == study.report.scores("", result.scored, threshold)[-2]
     elif brackets is not None:
         assert brackets == ", ".join(f"{value:,.0f}" for value in finals)
-
-
-def test_in_the_first_study_ecpo_has_the_largest_areas(study, committed):
-    for name in ("first_bandit", "first_tasks"):
-        areas = {key: study.scores.area(*r.scored).mean() for key, r in committed(name).items()}
-        assert all(areas[title, "ECPO"] >= area for (title, _), area in areas.items())
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/results.md"])

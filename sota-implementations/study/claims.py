@@ -17,7 +17,6 @@ from functools import cache
 import numpy as np
 import scores
 from manifest import read_manifests
-from numpy import mean, median
 from results import RESULTS, CellResult, read_cells
 
 from torchrl_ecpo.experiment.compare import Curve
@@ -70,10 +69,10 @@ def _flat(value) -> list[float]:
 
 
 def quotes(page: str) -> list[tuple[str, str]]:
-    """The claims that a page quotes, each with the text of its paragraph, list item or table.
+    r"""The claims that a page quotes, each with the text of its paragraph, list item or table.
 
     Examples:
-        >>> quotes("- Copy: 5 of\\n  **5**. <!-- claim: copy -->\\n- Reverse")
+        >>> quotes("- Copy: 5 of\n  **5**. <!-- claim: copy -->\n- Reverse")
         [('copy', '- Copy: 5 of 5.')]
     """
     found = []
@@ -96,6 +95,7 @@ def is_in(phrase: str, text: str) -> bool:
 # ------------------------------------------------------------------------- what expressions call
 
 
+mean, median = np.mean, np.median
 manifest = cache(read_manifests)
 
 
@@ -214,7 +214,7 @@ def intervals(study: str, *cells: str) -> list[float]:
 
 
 def settings(study: str, method: str, *values: str) -> np.ndarray:
-    """Mean of all measurements of the cells with these values of the grid, ``[tasks with runs]``."""
+    """Mean measurement of the cells with these values of the grid, ``[tasks with runs]``."""
     cells = [each for each in committed(study).values() if each.cell.method == method]
     chosen = [each for each in cells if tuple(v for _, v in each.cell.setting) == values]
     return np.array([each.scored[1].mean() for each in chosen if each.scored])

@@ -1,4 +1,4 @@
-"""What is committed of a study: its runs, their curves, each cell's configuration; and its reader."""
+"""What is committed of a study: its runs, their curves, each cell's configuration; its reader."""
 
 from __future__ import annotations
 
