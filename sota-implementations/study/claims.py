@@ -52,7 +52,7 @@ def now(phrase: str, expression: str) -> str:
     def written(match: re.Match[str]) -> str:
         digits = len(match[0].partition(".")[2])
         number = next(numbers) * (100 if phrase[match.end() :].startswith(("%", " %")) else 1)
-        return f"{round(number, digits) + 0.0:{',' if abs(number) >= 1000 else ''}.{digits}f}"
+        return f"{round(number, digits) + 0.0:,.{digits}f}"
 
     try:
         text = NUMBER.sub(written, phrase)
@@ -164,7 +164,7 @@ def needed(path: str, value: float | None = None) -> np.ndarray:
 
 
 def finite(values: np.ndarray) -> np.ndarray:
-    """Those that are."""
+    """The finite ones."""
     return values[np.isfinite(values)]
 
 
