@@ -10,6 +10,7 @@ import sys
 from functools import lru_cache
 from itertools import product, zip_longest
 from pathlib import Path
+from statistics import median
 from textwrap import dedent
 
 import pytest
@@ -74,6 +75,17 @@ def prose(page: Path) -> str:
 def python_blocks(page: Path) -> list[str]:
     blocks = FENCED.findall(page.read_text())
     return [dedent(block) for _, language, block in blocks if language == "python"]
+
+
+def sentences(page: Path) -> list[list[str]]:
+    """The words of each sentence outside code, tables, headings and pictures; a formula is one."""
+    text = re.sub(r"<!--.*?-->|\$\$.*?\$\$", "", FENCED.sub("", page.read_text()), flags=re.DOTALL)
+    text = re.sub(r"^ *(?:[|#!%]|\[!).*$", "", text, flags=re.MULTILINE)
+    text = re.sub(r"\]\([^)]*\)", "]", re.sub(r"`[^`]+`|\$[^$]+\$", "X", text))
+    paragraphs = re.split(r"\n\s*\n|\n(?= *(?:- |\d+\. ))", text.replace("Eq. ", "Eq."))
+    parts = (part for text in paragraphs for part in re.split(r"(?<=[.?!])[*)_]*\s+", text))
+    words = ([word for word in part.split() if re.search(r"\w", word)] for part in parts)
+    return [sentence for sentence in words if sentence]
 
 
 def links(page: Path) -> list[str]:
@@ -211,6 +223,22 @@ def test_the_page_of_equations_names_tests_that_exist():
         files = [(DOCS / link).read_text() for link in LINK.findall(row) if "/test_" in link]
         defined = {found for file in files for found in re.findall(r"^def (test_\w+)", file, re.M)}
         assert set(re.findall(r"`(test_\w+)`", row)) <= defined, row
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/results.md", "docs/searches.md"])
+def test_sentences_are_short_and_results_are_read_in_one_go(page):
+    text = sentences(ROOT / page)
+    assert median(map(len, text)) <= 16
+    assert [" ".join(words) for words in text if len(words) > 25] == []
+    assert len((ROOT / page).read_text().splitlines()) <= 450
+
+
+def test_sentences_are_counted_by_hand(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(
+        "# A heading\n\n- **One, two.** See [three four](x.md) in `a b`.\n- $5 + 5$ is Eq. 6\n"
+    )
+    assert [len(words) for words in sentences(page)] == [2, 5, 3]
 
 
 def test_a_wrong_option_is_noticed():
