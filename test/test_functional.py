@@ -1288,7 +1288,8 @@ def test_centred_scale_keeps_the_entropy_where_the_letter_inflates_it():
 
 @every_surrogate
 @pytest.mark.parametrize(
-    ("backend", "tensor_temperatures"), [("eager", True), ("aot_eager", False)]
+    ("backend", "tensor_temperatures"),
+    [("eager", True), pytest.param("aot_eager", False, marks=pytest.mark.slow)],
 )
 def test_surrogates_compile_without_a_graph_break(name, backend, tensor_temperatures):
     torch._dynamo.reset()
