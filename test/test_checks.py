@@ -47,5 +47,5 @@ def test_flags_of_numpy():
 def test_flags(value):
     """Which would be taken for its truth, as "no" for yes."""
     env = BanditEnv(num_actions=3, num_groups=1, group_size=2)
-    with pytest.raises(ValueError, match="sync must be one of True, False.*, got"):
+    with pytest.raises(ValueError, match=r"sync must be one of True, False.*, got"):
         TrajectoryGroupCollector(env, num_groups=1, group_size=2, sync=value)

@@ -545,14 +545,6 @@ def test_value_estimate_is_a_lower_bound_in_expectation_and_converges(tau, tau_p
 # ------------------------------------------------------------------------------------- identities
 
 
-def test_urex_weights_are_lifted_weights_at_tau_zero():
-    x = random_samples(3, 5)
-    lifted = lifted_log_weights(x.score, x.log_prob, tau=0.0, tau_prime=0.7)
-    actual = urex_surrogate(x.log_prob, x.score, tau=0.7).weights
-    assert_close(actual, self_normalised_weights(lifted))
-    assert_close(actual, (x.score / 0.7 - x.log_prob).softmax(-1))
-
-
 def test_pmd_at_the_reference_is_reinforce_with_mean_baseline_over_tau():
     x = random_samples(3, 5)
     log_weights = lifted_log_weights(x.score, x.log_prob, tau=0.7, tau_prime=0.0)
@@ -589,13 +581,6 @@ def test_control_variate_removes_the_drift_of_a_neutral_group():
 
     assert_close(grad(x.log_prob), torch.zeros(3, 5).double())
     assert_close(grad(None), torch.full((3, 5), -0.2).double())
-
-
-@PROPERTY
-@given(x=groups())
-def test_control_variate_coefficients_sum_to_zero(x):
-    grad = evaluate("mean_seeking_controlled", x).per_sample[1]
-    assert_close(grad.sum(), vector(0)[0], atol=1e-12, rtol=0)
 
 
 @TEMPERATURES
@@ -1007,15 +992,6 @@ def test_lift_divergence_estimate_by_hand(dtype, weights, mask, expected):
     assert_close(actual.item(), expected, atol=1e-6, rtol=1e-6)
 
 
-@PROPERTY
-@given(x=groups(), scale=st.floats(0, 1e3))
-def test_lift_divergence_estimate_is_between_zero_and_log_m(x, scale):
-    weights = self_normalised_weights(scale * x.score)
-    actual = lift_divergence_estimate(weights)
-    assert 0 <= actual <= math.log(weights.numel()) + 1e-9
-    assert_close(lift_divergence_estimate(weights.flip(0)), actual)
-
-
 @COUNTS
 @TEMPERATURES
 def test_lift_divergence_estimate_is_exact_on_an_exact_sample(counts, tau, tau_prime):
@@ -1177,7 +1153,7 @@ def _two_humps(u: Tensor) -> Tensor:
 @pytest.mark.parametrize(
     "log_density", [_two_humps, lambda u: -0.5 * (u - 1.5) ** 2 / 0.4], ids=["humps", "gaussian"]
 )
-@pytest.mark.parametrize("start", [(0.0, 1.0), (4.0, 0.3), (-3.0, 2.0)], ids=str)
+@pytest.mark.parametrize("start", [(4.0, 0.3), (-3.0, 2.0)], ids=str)
 def test_both_projections_have_the_same_minimiser(log_density, start):
     """Mean and variance of the target, by quadrature; and descent arrives there."""
     grid = torch.linspace(-12, 12, 20_001, dtype=torch.float64)

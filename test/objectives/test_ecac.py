@@ -443,15 +443,3 @@ def test_actions_by_number_and_one_hot():
         nn.functional.one_hot(number, CHOICES).bool(),
     ):
         assert_close(call(loss, batch.set("action", action)), expected)
-
-
-@pytest.mark.parametrize("name", ["discrete_ecac", "discrete_pmd_ac"])
-def test_actions_of_no_probability(name):
-    """Masked logits: no NaN, no weight, no gradient from the action that cannot be."""
-    case = CASES[name]
-    networks = make_networks(case.kind)
-    networks.actor[0].module[0].bias.data[2] = -1e9  # type: ignore
-    loss = case.build(networks, delay_actor=True)
-    outputs = call(loss, make_batch(case.kind))
-    assert all(output.isfinite() for output in outputs.values())
-    assert all(g.isfinite().all() for g in gradients(loss, outputs["loss_actor"]).values())
