@@ -205,7 +205,6 @@ def change_record(directory):
     ("spoil", "options", "message"),
     [
         (flip_a_bit, (), "checkpoint-0*20 is damaged: .*loss_module/state.pt has changed"),
-        (flip_a_bit, ("resume=auto",), "checkpoint-0*20 is damaged: .*loss_module/state.pt has"),
         (remove_checkpoints, (), "nothing to resume from, for .*checkpoints holds no checkpoint"),
         (make_foreign, (), "checkpoint-0*20 is no checkpoint of a run of this script"),
         (cut_record, (), "metrics.csv does not reach to step 20"),
