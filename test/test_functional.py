@@ -692,7 +692,7 @@ def evaluate_any(name: str, x: Samples, **where) -> Result:
 
 @pytest.mark.parametrize("name", [*FUNCTIONS, *ALGEBRA])
 @pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("shape", [(), (2,), (2, 3), (2, 1, 3)], ids=str)
+@pytest.mark.parametrize("shape", [(), (2, 1, 3)], ids=str)
 def test_leading_shapes_and_sample_dim(name, shape, masked):
     """Groups are independent, and the sample axis may stand anywhere."""
     x = random_samples(*shape, 4)
