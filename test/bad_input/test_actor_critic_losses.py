@@ -28,8 +28,9 @@ OPTIONS = {
 }
 
 NETWORKS = ("actor_network", "qvalue_network")
-WHOLE = ("ecac", "discrete_pmd_ac")
-"""Of these the networks and the batch are spoilt too, which the base reads for all."""
+WHOLE = ("ecac", "discrete_ecac", "discrete_pmd_ac")
+"""Of these the networks and the batch are spoilt too, which the base reads for all: actions that are
+vectors, numbers, and one-hot."""
 
 
 def accepted(loss):
