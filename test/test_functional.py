@@ -1321,6 +1321,18 @@ def test_check_temperatures():
         check_temperatures(tau=torch.tensor(1.0), tau_prime=math.nan)
 
 
+@pytest.mark.parametrize(
+    ("horizon", "n", "message"),
+    [
+        (0.5, 2, "horizon must be at least 1.*, got 0.5"),
+        (10, 1, "num_trajectories must be at least 2.*, got 1"),
+    ],
+)
+def test_theorem1_arguments_at_the_edges(horizon, n, message):
+    with pytest.raises(ValueError, match=message):
+        theorem1_temperatures(horizon, n)
+
+
 @pytest.mark.parametrize("name", ["urex", "ment", "soft_value_estimate"])
 def test_integer_scores_are_taken_as_numbers(name):
     x = random_samples(1, 3)._replace(score=torch.tensor([[1, 0, 2]]))

@@ -488,6 +488,7 @@ class TestSampler:
     @pytest.mark.parametrize(
         ("options", "error", "match"),
         [
+            ({"group_size": 1}, ValueError, "group_size must be an integer of at least 2.*got 1"),
             ({"batch_size": 5}, ValueError, r"num_groups \* group_size=2, got 5"),
             ({"num_groups": 3}, ValueError, r"num_groups=3 \* group_size=2, got 4"),
             ({"group_key": "instance"}, KeyError, "'instance' is missing.*problem instance"),

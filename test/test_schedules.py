@@ -127,6 +127,7 @@ def test_schedule_from_a_configuration(setting, at_five):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: linear(1.0, 0.0, 0), "duration must be positive, got 0"),
         (lambda: exponential(1.0, 0.0, 10), "Use a linear one to reach 0"),
         (lambda: make_schedule({"schedule": "cosine"}), "one of .*linear.*, got 'cosine'"),
         (lambda: make_schedule({"schedule": "linear", "start": 1.0}), "Wrong arguments.*'end'"),

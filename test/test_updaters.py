@@ -289,9 +289,10 @@ class TestErrors:
         with pytest.raises(ValueError, match=re.escape(message)):
             PolyakAverage(make_loss(), *networks)
 
-    def test_a_weight_above_one(self):
-        with pytest.raises(ValueError, match=r"weight must be in \(0, 1\], got 1.1"):
-            PolyakAverage(ddpg(), "actor_network", weight=1.1)
+    @pytest.mark.parametrize("weight", [0, 1.1])
+    def test_weights_at_the_edges(self, weight):
+        with pytest.raises(ValueError, match=rf"weight must be in \(0, 1\], got {weight}"):
+            PolyakAverage(ddpg(), "actor_network", weight=weight)
 
     def test_targets_that_require_a_gradient(self):
         loss = sac()

@@ -529,6 +529,7 @@ def test_bad_arguments_are_refused(arguments, message):
 @pytest.mark.parametrize(
     ("task", "instance", "message"),
     [
+        ("copy", torch.zeros(1, 2, 0, dtype=torch.int64), r"L in 1\.\.32, got \[1, 2, 0\]"),
         ("copy", torch.zeros(1, 2, 33, dtype=torch.int64), r"L in 1\.\.32, got \[1, 2, 33\]"),
         ("copy", torch.tensor([[[1, 2], [5, 1]]]), r"characters in 0\.\.4, .* got \[5, 1, -1"),
         ("copy", torch.tensor([[[1, 2], [-1, -1]]]), r"at least one, .* got \[-1, -1"),
