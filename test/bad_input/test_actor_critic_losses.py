@@ -29,8 +29,8 @@ OPTIONS = {
 
 NETWORKS = ("actor_network", "qvalue_network")
 WHOLE = ("ecac", "discrete_ecac", "discrete_pmd_ac")
-"""Of these the networks and the batch are spoilt too, which the base reads for all: actions that are
-vectors, numbers, and one-hot."""
+"""Of these the networks and the batch are spoilt too, which the base reads for all: with actions
+that are vectors, numbers, and one-hot."""
 
 
 def accepted(loss):
