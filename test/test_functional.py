@@ -545,6 +545,14 @@ def test_value_estimate_is_a_lower_bound_in_expectation_and_converges(tau, tau_p
 # ------------------------------------------------------------------------------------- identities
 
 
+def test_urex_weights_are_lifted_weights_at_tau_zero():
+    x = random_samples(3, 5)
+    lifted = lifted_log_weights(x.score, x.log_prob, tau=0.0, tau_prime=0.7)
+    actual = urex_surrogate(x.log_prob, x.score, tau=0.7).weights
+    assert_close(actual, self_normalised_weights(lifted))
+    assert_close(actual, (x.score / 0.7 - x.log_prob).softmax(-1))
+
+
 def test_pmd_at_the_reference_is_reinforce_with_mean_baseline_over_tau():
     x = random_samples(3, 5)
     log_weights = lifted_log_weights(x.score, x.log_prob, tau=0.7, tau_prime=0.0)

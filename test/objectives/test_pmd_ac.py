@@ -222,3 +222,10 @@ def test_discrete_divergence_by_summation(tau, tau_prime):
     expected = (policy.exp() * relative).sum(-1) + outputs["state_value"]
     assert_close(outputs["loss_actor"], expected.detach(), check_dtype=False)
     assert (outputs["loss_actor"] >= -1e-9).all()
+
+
+def test_pmd_ac_without_entropy():
+    """The paper's PMD-AC: tau' = 0."""
+    loss = CASE.build(tau_prime=0.0, delay_actor=True)
+    outputs = call(loss, make_batch())
+    assert all(output.isfinite() for output in outputs.values())
