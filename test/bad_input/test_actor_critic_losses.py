@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from copy import deepcopy
 
 import pytest
 import torch
@@ -76,9 +77,9 @@ def test_actor_critic_losses(name):
     case = CASES[name]
     options = {key: x for key, x in OPTIONS.items() if key in accepted(case.loss) and x is not None}
     options |= {"tau": 0.75, "tau_prime": 0.25, "gamma": 0.9}
-    others = batch(case)
-    others["actor_network"] = lambda: make_networks(case.kind).actor
-    others["qvalue_network"] = lambda: make_networks(case.kind).qvalues[0]
+    others, networks = batch(case), make_networks(case.kind)
+    others["actor_network"] = lambda: deepcopy(networks.actor)
+    others["qvalue_network"] = lambda: deepcopy(networks.qvalues[0])
     is_whole = name in WHOLE
     subject = Subject(
         lambda entries: call(case, {**others, **entries} if not is_whole else entries),
