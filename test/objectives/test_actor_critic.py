@@ -857,6 +857,20 @@ def test_skip_done_states(case):
         case.build()(batch)
 
 
+def test_the_lift_of_the_next_state_is_given_what_the_networks_read(monkeypatch):
+    """And nothing else of what stands there."""
+    loss, given = CASE.build(), []
+    lift = loss.lift
+
+    def watched(observations, *args):
+        given.append([*observations.keys()])
+        return lift(observations, *args)
+
+    monkeypatch.setattr(loss, "lift", watched)
+    loss.soft_bellman_target(_batch())
+    assert given == [["observation"]]
+
+
 def test_skipped_states_keep_their_dtype():
     """Integer observations, such as pixels or tokens, stay integers."""
     networks = make_networks()
