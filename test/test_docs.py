@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import re
 import shlex
-import subprocess
-import sys
 from functools import lru_cache
 from itertools import product, zip_longest
 from pathlib import Path
@@ -18,6 +16,7 @@ import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
+from processes import run_script
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -111,7 +110,10 @@ def composed(config_directory: Path, overrides: tuple[str, ...]) -> DictConfig:
 
 
 def compose_command(script: Path, options: str) -> None:
-    """Compose the runs that a command line starts: of a sweep, every value of every option once."""
+    """Compose the runs that a command line starts: of a sweep, every value of every option once.
+
+    Of seeds one, for they compose alike.
+    """
     words = shlex.split(options, comments=True)
     overrides = [word for word in words if not word.startswith("-")]
     parsed = OverridesParser.create().parse_overrides(overrides)
@@ -121,6 +123,7 @@ def compose_command(script: Path, options: str) -> None:
         else [str(override.input_line)]
         for override in parsed
     ]
+    choices = [values[:1] if values[0].startswith("seed=") else values for values in choices]
     for run in list(zip_longest(*choices)) or [()]:
         overrides = (value or values[0] for value, values in zip(run, choices, strict=True))
         config = composed(script.parent / "config", tuple(overrides))
@@ -137,7 +140,8 @@ def test_examples_run(page, tmp_path, monkeypatch):
     for script, options in commands(page):
         directory = re.search(r"hydra\.run\.dir=(\S+)", options)
         if directory and any(directory[1] in block for block in blocks):  # which read this run
-            subprocess.run([sys.executable, script, *shlex.split(options)], check=True)
+            process = run_script(tmp_path, script, *shlex.split(options))
+            assert process.returncode == 0, process.stderr
     namespace: dict[str, object] = {"__name__": "__main__"}
     for number, block in enumerate(blocks, start=1):
         exec(compile(block, f"{name(page)}, python block {number}", "exec"), namespace)
