@@ -204,8 +204,19 @@ class DiscreteECACLoss(ECACLoss):
         actor_network: ProbabilisticTensorDictSequential,
         qvalue_network: TensorDictModule | list[TensorDictModule],
         value_network: TensorDictModule | None = None,
+        *,
+        tau_prime: float = 0.1,
+        target_kl: float | None = 0.1,
+        target_entropy: float | Literal["auto"] | None = None,
         **options: Any,
     ) -> None:
-        defaults = {"tau_prime": 0.1, "target_kl": 0.1, "target_entropy": None}
-        networks = (actor_network, qvalue_network, value_network)
-        super().__init__(*networks, projection="paper", **(defaults | options))
+        super().__init__(
+            actor_network,
+            qvalue_network,
+            value_network,
+            tau_prime=tau_prime,
+            target_kl=target_kl,
+            target_entropy=target_entropy,
+            projection="paper",
+            **options,
+        )

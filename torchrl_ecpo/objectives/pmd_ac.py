@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 
@@ -64,10 +64,23 @@ class PMDACLoss(ActorCriticLoss):
         actor_network: ProbabilisticTensorDictSequential,
         qvalue_network: TensorDictModule | list[TensorDictModule],
         value_network: TensorDictModule | None = None,
+        *,
+        tau: float = 0.1,
+        target_kl: float | None = None,
+        num_action_samples: int = 1,
+        delay_actor: bool = True,
         **options: Any,
     ) -> None:
-        defaults = {"tau": 0.1, "target_kl": None, "num_action_samples": 1, "delay_actor": True}
-        super().__init__(actor_network, qvalue_network, value_network, **(defaults | options))
+        super().__init__(
+            actor_network,
+            qvalue_network,
+            value_network,
+            tau=tau,
+            target_kl=target_kl,
+            num_action_samples=num_action_samples,
+            delay_actor=delay_actor,
+            **options,
+        )
 
     def project(self, states: States) -> Surrogate:
         """(tau + tau') KL(pi_theta, target), in the unit of Q: by one action, or summed."""
@@ -111,7 +124,16 @@ class DiscretePMDACLoss(PMDACLoss):
         actor_network: ProbabilisticTensorDictSequential,
         qvalue_network: TensorDictModule | list[TensorDictModule],
         value_network: TensorDictModule | None = None,
+        *,
+        tau_prime: float = 0.1,
+        target_entropy: float | Literal["auto"] | None = None,
         **options: Any,
     ) -> None:
-        defaults = {"tau_prime": 0.1, "target_entropy": None}
-        super().__init__(actor_network, qvalue_network, value_network, **(defaults | options))
+        super().__init__(
+            actor_network,
+            qvalue_network,
+            value_network,
+            tau_prime=tau_prime,
+            target_entropy=target_entropy,
+            **options,
+        )
