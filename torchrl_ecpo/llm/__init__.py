@@ -1,4 +1,4 @@
-"""Groups of completions: what TorchRL's language-model wrappers write, for the losses over groups."""
+"""Groups of completions: what TorchRL's language-model wrappers write."""
 
 from torchrl_ecpo.llm.completions import check_sampler, record_log_probs
 

@@ -292,8 +292,8 @@ def _after_prompt(
     if rows.get(prompt_key, None, as_list=True) is None:
         raise KeyError(
             f"The entry {prompt_key!r} is missing, after which a completion begins; there are "
-            f"{present(rows)}. Or name a mask of the policy's own tokens: loss_module.loss_mask_key "
-            "= ('masks', 'all_assistant_mask')."
+            f"{present(rows)}. Or name a mask of the policy's own tokens: "
+            "loss_module.loss_mask_key = ('masks', 'all_assistant_mask')."
         )
     prompt, length = _padded(rows, prompt_key, 0), tokens.shape[-1]
     of_prompt, of_all = (

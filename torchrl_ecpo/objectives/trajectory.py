@@ -252,7 +252,8 @@ class TrajectoryGroupLoss(PolicyLoss):
 
     def _take(self, actor_network: Any) -> None:
         """A language model stays a part of the loss, as it is: one too large for a second copy."""
-        if not is_language_model(actor_network):
+        self._reads_completions = is_language_model(actor_network)
+        if not self._reads_completions:
             super()._take(actor_network)
             return
         check_actor(actor_network)
@@ -262,10 +263,6 @@ class TrajectoryGroupLoss(PolicyLoss):
                 "the reference policy is the one that the log-probabilities were recorded of."
             )
         self.actor_network = actor_network
-
-    @property
-    def _reads_completions(self) -> bool:
-        return is_language_model(self.actor_network)
 
     # ------------------------------------------------------------------------------- one method
 
@@ -307,31 +304,20 @@ class TrajectoryGroupLoss(PolicyLoss):
     # ------------------------------------------------------------------------------------- keys
 
     @property
-    def mask_keys(self) -> tuple[NestedKey, ...]:
-        """The masks that ``loss_mask_key`` names; of completions, none but by a name."""
-        is_told = self._reads_completions and self.loss_mask_key == "auto"  # by their prompts
-        return () if is_told else super().mask_keys
-
-    @property
     def _all_in_keys(self) -> list[NestedKey]:
         actor: Any = self.actor_network
-        of_completions = (
-            [
-                (actor.tokens_key, "prompt"),
-                (actor.masks_key, "all_attention_mask"),
-                self.tensor_keys.prompt,
-            ]
-            if self._reads_completions
-            else []
-        )
+        mask_keys = self.mask_keys[:1]
+        if self._reads_completions:
+            mask_keys = () if self.loss_mask_key == "auto" else mask_keys  # prompts tell
+            mask_keys += ((actor.tokens_key, "prompt"), (actor.masks_key, "all_attention_mask"))
+            mask_keys += (self.tensor_keys.prompt,)
         return [
             *actor.in_keys,
-            *of_completions,
             *self.further_in_keys,
             *_as_list(self.tensor_keys.action),
             self._reward_key,
             *_as_list(self.tensor_keys.sample_log_prob),
-            *self.mask_keys[:1],
+            *mask_keys,
             *self._latent_keys,
         ]
 
@@ -395,7 +381,7 @@ class TrajectoryGroupLoss(PolicyLoss):
                 "torchrl_ecpo.llm.record_log_probs(actor, batch), before the first update."
             )
         if values_can_be_seen():
-            self._check_left(found.mask)
+            self._check_left(self.loss_mask_key, found.mask)
         return Steps(found.rewards, found.log_prob, found.recorded, found.recorded, found.mask)
 
     def _read_steps(self, tensordict: TensorDictBase) -> Steps:
@@ -408,7 +394,7 @@ class TrajectoryGroupLoss(PolicyLoss):
             real_steps = torch.ones(shape, dtype=torch.bool, device=reward.device)
             if mask is not None:
                 check_padding(self.mask_keys, mask)
-                self._check_left(mask)
+                self._check_left(self.mask_keys, mask)
                 real_steps = mask
             if self._lacks_time(tensordict, real_steps):
                 steps = tensordict.copy()
@@ -613,12 +599,12 @@ class TrajectoryGroupLoss(PolicyLoss):
             "instance."
         )
 
-    def _check_left(self, mask: Tensor) -> None:
+    def _check_left(self, name: Any, mask: Tensor) -> None:
         """Refuse groups of which a mask leaves too little."""
         is_small = mask.any(-1).sum(-1) < 2
         if is_small.any():
             raise ValueError(
-                f"The mask {self.mask_keys or '(what comes after the prompts)'} leaves {int(is_small.sum())} group(s) "
+                f"The mask ({name}) leaves {int(is_small.sum())} group(s) "
                 "with fewer than two trajectories that have a real step: weights are relative to "
                 "the other trajectories of the group. Drop such groups before calling the loss."
             )
