@@ -178,10 +178,8 @@ def test_keywords(model):
 def test_a_mask_of_several_turns(model):
     """Tokens between turns are context: what the actor reads, and count for nothing."""
     actor, batch = make(model)
-    own = [
-        [False] * len(prompt) + [True] * len(r)
-        for prompt, r in zip(PROMPTS, RESPONSES, strict=True)
-    ]
+    lengths = [(len(prompt), len(row)) for prompt, row in zip(PROMPTS, RESPONSES, strict=True)]
+    own = [[False] * of_prompt + [True] * of_response for of_prompt, of_response in lengths]
     own[3] = [False, False, True, True, False, False, True]
     for row, mask in zip(batch.unbind(0), own, strict=True):
         row["masks", "all_assistant_mask"] = torch.tensor(mask)
@@ -277,11 +275,10 @@ def test_what_a_wrapper_samples(model, pad_output):
         assert_close(old[1:][real[1:]], new[1:][real[1:]], rtol=1e-4, atol=1e-4)
     losses = ECPOLoss(actor)(batch)
     assert abs(losses["kl_reference_policy"]) < 1e-5
-    zeroed = batch.get(RECORDED, as_padded_tensor=True, padding_side="left", padding_value=0.0)
-    if pad_output:
-        zeroed[:, len(prompts[0])] = 0
-        with pytest.raises(ValueError, match="0 for the first token"):
-            ECPOLoss(actor)(batch)
+    for row, prompt in zip(batch.unbind(0), prompts, strict=True):
+        row.get(RECORDED)[len(prompt)] = 0
+    with pytest.raises(ValueError, match=r"0 for the first token.*record_log_probs"):
+        ECPOLoss(actor)(batch)
 
 
 def test_half_precision(model):
