@@ -14,6 +14,7 @@ import argparse
 import statistics
 import time
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from csv_table import add_csv_option, write_csv
@@ -31,7 +32,7 @@ SIZES = ((32, 512, 1024), (32, 64, 256), (8, 16, 1024))
 """Completions, tokens of a prompt, tokens of a completion."""
 
 
-def make_actor(length: int) -> TransformersWrapper:
+def make_actor(length: int) -> Any:
     """A Llama made from its config, and a tokenizer that has but its special tokens."""
     from tokenizers import Tokenizer, models
 
@@ -80,8 +81,9 @@ def peak(update: Callable[[], object]) -> float:
     """The most that lives at once beyond what lives before, in MB."""
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as profiler:
         update()
+    recorded: Any = profiler.profiler
     alive = most = 0
-    for event in sorted(profiler.profiler.kineto_results.events(), key=lambda e: e.start_ns()):
+    for event in sorted(recorded.kineto_results.events(), key=lambda event: event.start_ns()):
         if event.name() == "[memory]":
             alive += event.nbytes()
             most = max(most, alive)

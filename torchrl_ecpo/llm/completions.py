@@ -154,7 +154,7 @@ def record_log_probs(actor: Any, tensordict: TensorDictBase) -> TensorDictBase:
     tokens = _padded(rows, (actor.tokens_key, "full"), 0)
     log_prob = _log_prob(logits, tokens, _with_context(attention, attention))
     key = (actor.log_probs_key, "full")
-    lengths = _lengths(rows, (actor.tokens_key, "full"))
+    lengths = [len(row) for row in _entries(rows, (actor.tokens_key, "full"))]
     if min(lengths) == max(lengths):
         return tensordict.set(key, log_prob.reshape(*tensordict.shape, -1))
     for row, length, values in zip(rows.unbind(0), lengths, log_prob, strict=True):
@@ -205,7 +205,7 @@ def read_completions(
     mask = _with_context(mask, attention)
     log_prob = _log_prob(logits, tokens, mask)
     recorded = None
-    if rows.get(log_prob_key, None, as_list=True) is not None:
+    if _entries(rows, log_prob_key) is not None:
         recorded = _recorded(_padded(rows, log_prob_key, 0.0), log_prob_key, log_prob, mask)
         recorded = recorded[members]
     last = mask & (mask.flip(-1).cumsum(-1).flip(-1) == 1)
@@ -218,7 +218,7 @@ def read_completions(
 
 def _members(tensordict: TensorDictBase, prompt_key: NestedKey) -> Tensor:
     """The rows of each group ``[*G, K]``, as numbers among all rows."""
-    prompts = tensordict.reshape(-1).get(prompt_key, None, as_list=True)
+    prompts = _entries(tensordict.reshape(-1), prompt_key)
     if prompts is not None:
         prompts = prompts.tolist() if hasattr(prompts, "tolist") else prompts
         prompts = [_hashable(prompt) for prompt in prompts]
@@ -256,7 +256,7 @@ def _hashable(entry: Any) -> Any:
     return tuple(entry) if isinstance(entry, list) else entry
 
 
-def _padded(rows: TensorDictBase, key: NestedKey, fill: float) -> Tensor:
+def _padded(rows: Any, key: NestedKey, fill: float) -> Tensor:
     """An entry ``[B, L, ...]``; rows of unequal length are padded on the left."""
     value = rows.get(key, None, as_padded_tensor=True, padding_side="left", padding_value=fill)
     if value is None:
@@ -264,9 +264,9 @@ def _padded(rows: TensorDictBase, key: NestedKey, fill: float) -> Tensor:
     return value
 
 
-def _lengths(rows: TensorDictBase, key: NestedKey) -> list[int]:
-    """Of each row, with the padding that it has itself."""
-    return [len(row) for row in rows.get(key, as_list=True)]
+def _entries(rows: Any, key: NestedKey) -> Any:
+    """An entry row by row, each with the padding that it has itself; None if it is missing."""
+    return rows.get(key, None, as_list=True)
 
 
 def _logits(actor: Any, rows: TensorDictBase) -> tuple[Tensor, Tensor]:
@@ -289,7 +289,7 @@ def _after_prompt(
     rows: TensorDictBase, tokens: Tensor, tokens_key: NestedKey, prompt_key: NestedKey
 ) -> Tensor:
     """Which tokens ``[B, L]`` come after the prompt."""
-    if rows.get(prompt_key, None, as_list=True) is None:
+    if _entries(rows, prompt_key) is None:
         raise KeyError(
             f"The entry {prompt_key!r} is missing, after which a completion begins; there are "
             f"{present(rows)}. Or name a mask of the policy's own tokens: "
@@ -297,7 +297,7 @@ def _after_prompt(
         )
     prompt, length = _padded(rows, prompt_key, 0), tokens.shape[-1]
     of_prompt, of_all = (
-        torch.tensor(_lengths(rows, key), device=tokens.device).unsqueeze(-1)
+        torch.tensor([len(row) for row in _entries(rows, key)], device=tokens.device).unsqueeze(-1)
         for key in (prompt_key, tokens_key)
     )
     begin = length - of_all + of_prompt

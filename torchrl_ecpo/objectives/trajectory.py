@@ -139,7 +139,10 @@ class TrajectoryGroupLoss(PolicyLoss):
         actor_network: a policy with ``get_dist``: feed-forward or recurrent (it is called in
             recurrent mode on ``[N, T]``), with any action distribution whose log-probability has
             the shape of the batch, also a composite one (the parts are added up), or several
-            distributions, each of which may read what those before it have drawn.
+            distributions, each of which may read what those before it have drawn. Or a wrapper of a
+            language model, ``TransformersWrapper(..., generate=False)``: then the batch is one of
+            completions, ``[B]`` or ``[*G, K]``, as TorchRL's own ``GRPOLoss`` takes it
+            (:mod:`torchrl_ecpo.llm`), and the T steps are their tokens.
 
     Keyword Args:
         temperatures: initial values by name; each becomes a buffer that is scheduled by assignment
@@ -364,7 +367,7 @@ class TrajectoryGroupLoss(PolicyLoss):
         return TrajectoryGroups(returns, log_prob, reference, behaviour, mask, steps, scores)
 
     def _read_completions(self, tensordict: TensorDictBase) -> Steps:
-        keys = self.tensor_keys
+        keys: Any = self.tensor_keys
         found = read_completions(
             self.actor_network,
             tensordict,
