@@ -90,6 +90,13 @@ def check_sampler(sampler: Any) -> None:
         ValueError: for greedy decoding (the default of transformers), a temperature other than 1,
             top-k (by default, transformers draws from the 50 likeliest tokens), top-p, min-p or a
             repetition penalty, be it the wrapper's or of the model's ``generation_config``.
+
+    Examples:
+        >>> from types import SimpleNamespace
+        >>> sampler = SimpleNamespace(generate_kwargs={"temperature": 0.7})  # as of a wrapper
+        >>> check_sampler(sampler)  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ValueError: The sampler has temperature=0.7, so that it draws from another distribution ...
     """
     config = getattr(getattr(sampler, "model", None), "generation_config", None)
     settings = _settings(sampler)
@@ -146,6 +153,23 @@ def record_log_probs(actor: Any, tensordict: TensorDictBase) -> TensorDictBase:
 
     Raises:
         ValueError: if dropout is on, or a padding token stands between others.
+
+    Examples:
+        A wrapper by its interface alone, of which each of 3 tokens has probability 1/3:
+
+        >>> from types import SimpleNamespace
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules.distributions import LLMMaskedCategorical
+        >>> mask = torch.ones(2, 3, dtype=torch.bool)
+        >>> actor = torch.nn.Module()
+        >>> actor.tokens_key, actor.masks_key, actor.log_probs_key = "tokens", "masks", "log_probs"
+        >>> actor.generate, actor.in_keys = False, [("tokens", "full")]
+        >>> actor.tokenizer = SimpleNamespace(pad_token_id=0, eos_token_id=1)
+        >>> actor.get_dist = lambda *_, **__: LLMMaskedCategorical(torch.zeros(2, 3, 3), mask)
+        >>> tokens = torch.tensor([[2, 2, 1], [2, 1, 2]])
+        >>> batch = TensorDict({"tokens": {"full": tokens}}, [2])
+        >>> record_log_probs(actor, batch)["log_probs", "full"][0]
+        tensor([ 0.0000, -1.0986, -1.0986])
     """
     check_actor(actor)
     _check_dropout(actor)
