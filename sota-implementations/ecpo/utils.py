@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from tasks import Metrics, Task
+from tasks import Metrics, Task, make_copy
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 
@@ -33,6 +33,8 @@ COMPILABLE = ("bandit", "gym")
 def check_config(config: DictConfig) -> None:
     """Refuse options that do not go together."""
     loss_class(config.loss)
+    if config.env.kind == "gym":
+        make_copy(config.env.name).close()
     if config.compile and not (config.seeds is None and config.stack is None):
         raise ValueError(
             "compile=true is for single runs. Leave out compile, or seeds and stack: --multirun "
@@ -77,7 +79,7 @@ def make_collector(config: DictConfig, task: Task) -> TrajectoryGroupCollector:
         num_groups=config.num_groups,
         group_size=config.group_size,
         # The loss computes them anew; they are most of a batch.
-        exclude_keys=["logits", "loc", "scale", "parameters"],
+        exclude_keys=["logits", "loc", "scale", "parameters", "params"],
         **options,
     )
     collector.set_seed(config.seed)
@@ -93,7 +95,12 @@ def make_loss(config: DictConfig, actor: ProbabilisticTensorDictSequential) -> T
     """The loss that ``loss=`` names; ``make_temperatures`` sets its temperatures."""
     apart = ("name", "class", *TEMPERATURES)
     options = {str(k): v for k, v in config.items() if k not in apart}
-    return loss_class(config)(actor, **options)
+    loss_module = loss_class(config)(actor, **options)
+    head: Any = actor[-1]
+    if len(head.dist_sample_keys) > 1:
+        names = {"action": head.dist_sample_keys, "sample_log_prob": head.log_prob_keys}
+        loss_module.set_keys(**names)
+    return loss_module
 
 
 def loss_class(config: DictConfig) -> type[TrajectoryGroupLoss]:

@@ -8,6 +8,7 @@ from torchrl_ecpo.modules.actor_critic import (
     make_value_network,
 )
 from torchrl_ecpo.modules.latents import record_latents
+from torchrl_ecpo.modules.pixels import PixelEncoder
 from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
 from torchrl_ecpo.modules.softmax import LinearSoftmax, SharedCategorical, make_softmax_policy
 from torchrl_ecpo.modules.tuple_policy import TupleCategorical, TupleTables, make_tuple_policy
@@ -19,6 +20,7 @@ __all__ = [
     "DistinctWindowNetwork",
     "LinearSoftmax",
     "OneHotLinear",
+    "PixelEncoder",
     "SharedCategorical",
     "TupleCategorical",
     "TupleTables",
