@@ -70,6 +70,8 @@ class Task:
     """Metrics on the progress bar and in the picture."""
     evaluation_env: nn.Module | None = None
     """Its state goes into checkpoints."""
+    least_entropy: float = 0.01
+    """In nats a step; with less, a policy does not explore."""
 
 
 def make_task(config: DictConfig) -> Task:
@@ -225,7 +227,14 @@ def make_gym(config: DictConfig) -> Task:
         return {"greedy_return": _returns(_greedy(evaluation_env, actor)).mean()}
 
     shown = ("return", "greedy_return", "entropy", "ESS")
-    return Task(env, make_env, actor, measure, evaluate, shown, copies)
+    return Task(env, make_env, actor, measure, evaluate, shown, copies, least_entropy(env))
+
+
+def least_entropy(env: EnvBase) -> float:
+    """0.01 nats for choices; for numbers, that of a uniform one within e^-5 of its range."""
+    specs: Any = env.full_action_spec_unbatched.values(True, True)
+    ranges = [spec.space.high - spec.space.low for spec in specs if isinstance(spec, Bounded)]
+    return 0.01 + sum(float((width.log() - 5).sum()) for width in ranges)
 
 
 class Choices(Independent):

@@ -2,6 +2,8 @@
 
 from torchrl_ecpo.modules.actor_critic import (
     DenseNetwork,
+    make_action_value_network,
+    make_categorical_actor,
     make_deterministic_actor,
     make_qvalue_network,
     make_tanh_gaussian_actor,
@@ -24,6 +26,8 @@ __all__ = [
     "SharedCategorical",
     "TupleCategorical",
     "TupleTables",
+    "make_action_value_network",
+    "make_categorical_actor",
     "make_deterministic_actor",
     "make_qvalue_network",
     "make_softmax_policy",
