@@ -18,7 +18,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.collectors import Collector
-from torchrl.data import Categorical, LazyMemmapStorage, LazyTensorStorage, ReplayBuffer
+from torchrl.data import Bounded, Categorical, LazyMemmapStorage, LazyTensorStorage, ReplayBuffer
 from torchrl.envs import (
     CatTensors,
     Compose,
@@ -190,8 +190,8 @@ def _missing(task: str, error: Exception) -> ModuleNotFoundError:
 def make_actor(config: DictConfig, env: EnvBase) -> TensorDictModuleBase:
     """The policy without exploration."""
     spec: Any = env.action_spec_unbatched
-    is_one_choice = isinstance(spec, Categorical) and not spec.ndim
-    if is_one_choice != (config.loss.actor == "categorical"):
+    kind = Categorical if config.loss.actor == "categorical" else Bounded
+    if not isinstance(spec, kind) or (kind is Categorical and spec.ndim):
         raise ValueError(
             f"loss={config.loss.name} does not go with env.name={config.env.name}, whose actions "
             f"are {type(spec).__name__}: one discrete action is for loss=discrete_ecac or "
