@@ -11,6 +11,7 @@ import sys
 from itertools import pairwise
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -276,8 +277,11 @@ def own_tasks(tmp_path, monkeypatch):
     monkeypatch.setenv(
         "PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
     )
+    known = dict(gym.registry)
     yield "own_tasks"
     sys.modules.pop("own_tasks", None)
+    gym.registry.clear()
+    gym.registry.update(known)
 
 
 def test_tasks_of_ones_own_train(tmp_path, own_tasks):

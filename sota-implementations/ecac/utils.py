@@ -139,7 +139,7 @@ def _make_with_pixels(config: DictConfig, make: Callable[..., EnvBase]) -> EnvBa
 def _make_gym(config: DictConfig, *, from_pixels: bool = False, **options: Any) -> EnvBase:
     """A task of gymnasium, with spaces that the networks can read and play."""
     try:
-        drawn = {"render_mode": "rgb_array"} if from_pixels else {}
+        drawn: dict[str, Any] = {"render_mode": "rgb_array"} if from_pixels else {}
         env = readable(gym.make(config.name, disable_env_checker=True, **drawn))
     except (gym.error.DependencyNotInstalled, ModuleNotFoundError) as error:
         raise _missing(config.name, error) from error
@@ -155,7 +155,7 @@ def _make_gym(config: DictConfig, *, from_pixels: bool = False, **options: Any) 
 
 def chosen_loss(options: Sequence[str]) -> list[str]:
     """The option ``loss=``, if none is given and a task of gymnasium takes one discrete action."""
-    given = dict(option.partition("=")[::2] for option in options)
+    given = {name: value for name, _, value in (option.partition("=") for option in options)}
     if "loss" in given or given.get("env") != "gym":
         return []
     with suppress(gym.error.Error, ModuleNotFoundError, ValueError):  # which is said later

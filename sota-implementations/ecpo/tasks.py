@@ -232,9 +232,12 @@ def make_gym(config: DictConfig) -> Task:
 
 def least_entropy(env: EnvBase) -> float:
     """0.01 nats for choices; for numbers, that of a uniform one within e^-5 of its range."""
-    specs: Any = env.full_action_spec_unbatched.values(True, True)
-    ranges = [spec.space.high - spec.space.low for spec in specs if isinstance(spec, Bounded)]
-    return 0.01 + sum(float((width.log() - 5).sum()) for width in ranges)
+    least = 0.01
+    for spec in env.full_action_spec_unbatched.values(True, True):
+        if isinstance(spec, Bounded):
+            space: Any = spec.space
+            least += float(((space.high - space.low).log() - 5).sum())
+    return least
 
 
 class Choices(Independent):
@@ -255,7 +258,7 @@ class Head(NamedTuple):
     """Number of these outputs."""
     names: Sequence[str]
     """Of the distribution's parameters."""
-    split: Callable[[Tensor], Sequence[Tensor]]
+    split: nn.Module
     """From the outputs to the parameters."""
     distribution: type
     options: dict[str, Any]
@@ -263,18 +266,41 @@ class Head(NamedTuple):
     @classmethod
     def of(cls, spec: Any, one: tuple[int, ...]) -> Head:
         """Categorical for a choice or several, tanh-Gaussian for bounded numbers."""
+        space = spec.space
         if isinstance(spec, Bounded):
-            bounds = {"low": spec.space.low[one], "high": spec.space.high[one]}
+            bounds = {"low": space.low[one], "high": space.high[one]}
             size = 2 * spec.shape[-1]
             return cls(size, ["loc", "scale"], NormalParamExtractor(), TanhNormal, bounds)
         if spec.ndim == len(one):
-            return cls(spec.space.n, ["logits"], lambda logits: (logits,), Categorical, {})
-        nvec = (
-            spec[one].nvec.tolist()
-            if isinstance(spec, MultiCategorical)
-            else [spec.space.n] * spec.shape[-1]
-        )
-        return cls(sum(nvec), ["logits"], lambda logits: (logits,), Choices, {"nvec": nvec})
+            return cls(space.n, ["logits"], Alone(), Categorical, {})
+        if isinstance(spec, MultiCategorical):
+            first: Any = spec[one]  # pyright: ignore[reportArgumentType] - it takes a tuple
+            nvec = first.nvec.tolist()
+        else:
+            nvec = [space.n] * spec.shape[-1]
+        return cls(sum(nvec), ["logits"], Alone(), Choices, {"nvec": nvec})
+
+
+class Split(nn.Module):
+    """The outputs of a network as the parameters of each head, one head after the other."""
+
+    def __init__(self, heads: Sequence[Head]) -> None:
+        super().__init__()
+        self.sizes = [head.size for head in heads]
+        self.splits = nn.ModuleList(head.split for head in heads)
+
+    def forward(self, outputs: Tensor) -> tuple[Tensor, ...]:
+        """From ``[..., n]``."""
+        of_heads = zip(self.splits, outputs.split(self.sizes, -1), strict=True)
+        return tuple(part for split, own in of_heads for part in split(own))
+
+
+class Alone(nn.Module):
+    """The outputs are the one parameter."""
+
+    def forward(self, outputs: Tensor) -> tuple[Tensor]:
+        """As they are."""
+        return (outputs,)
 
 
 def make_feed_forward_policy(
@@ -285,18 +311,19 @@ def make_feed_forward_policy(
     It has a head for the actions: categorical or tanh-Gaussian, or one of each.
     """
     one = (0,) * env.ndim
-    heads = {key: Head.of(spec, one) for key, spec in env.full_action_spec.items(True, True)}
-    sizes = [head.size for head in heads.values()]
+    specs: Any = env.full_action_spec.items(True, True)
+    heads: dict[Any, Head] = {key: Head.of(spec, one) for key, spec in specs}
     shape = env.observation_spec["observation"].shape[env.ndim :]
     encoder = PixelEncoder(shape) if len(shape) == 3 else None
     network: nn.Module = MLP(
         in_features=shape[-1] if encoder is None else encoder.size,
-        out_features=sum(sizes),
+        out_features=sum(head.size for head in heads.values()),
         num_cells=list(hidden_sizes),
         activation_class=nn.Tanh,
     )
     if encoder is not None:
         network = nn.Sequential(encoder, network)
+    names: list[Any]
     if list(heads) == ["action"]:
         head = heads["action"]
         names = in_keys = list(head.names)
@@ -309,14 +336,9 @@ def make_feed_forward_policy(
             "extra_kwargs": {key: head.options for key, head in heads.items()},
         }
 
-    def split(parameters: Tensor) -> tuple[Tensor, ...]:
-        """Into the parameters of each head."""
-        each = zip(heads.values(), parameters.split(sizes, -1), strict=True)
-        return tuple(x for head, own in each for x in head.split(own))
-
     parts: list[Any] = [
         TensorDictModule(network, ["observation"], ["parameters"]),
-        TensorDictModule(split, ["parameters"], names),
+        TensorDictModule(Split(list(heads.values())), ["parameters"], names),
     ]
     return ProbabilisticActor(
         TensorDictSequential(*parts),

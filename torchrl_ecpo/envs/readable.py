@@ -133,7 +133,7 @@ def _with_plain_actions(env: gym.Env) -> gym.Env:
         if isinstance(part, spaces.Box):
             _check_box(env, part)
     nvec = [int(n) for part in parts for n in _sizes(part)]
-    boxes = [spaces.utils.flatten_space(part) for part in parts if isinstance(part, spaces.Box)]
+    boxes = [spaces.flatten_space(part) for part in parts if isinstance(part, spaces.Box)]
     choices: Any = spaces.Discrete(nvec[0]) if len(nvec) == 1 else spaces.MultiDiscrete(nvec or [1])
     if not boxes:
         plain = choices
@@ -196,7 +196,7 @@ def _arrange(space: gym.Space, action: Any) -> Any:
             flat += (
                 [choice] if isinstance(part, spaces.MultiBinary) else np.eye(size)[choice].tolist()
             )
-    return spaces.utils.unflatten(space, np.array(flat))
+    return spaces.unflatten(space, np.array(flat))
 
 
 def _refused(env: gym.Env, reason: str) -> ValueError:

@@ -414,6 +414,11 @@ def _network(
         sizes = [check_count("observation_size", observation_size) + action_size, *hidden]
         sizes.append(num_outputs)
         return DenseNetwork(["observation", *action], out_keys, sizes, **options)
+    if len(observation_size) != 3:
+        raise ValueError(
+            "observation_size must be an integer of at least 1, or (channels, height, width) of "
+            f"pixels, got {observation_size!r}."
+        )
     encoder = PixelEncoder(observation_size)
     sizes = [encoder.size + action_size, *hidden, num_outputs]
     parts: list[Any] = [
