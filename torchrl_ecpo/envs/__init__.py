@@ -4,6 +4,7 @@ from torchrl_ecpo.envs._groups import GroupIdAllocator
 from torchrl_ecpo.envs.algorithmic import TASKS, AlgorithmicEnv, AlgorithmicTask
 from torchrl_ecpo.envs.bandit import BanditEnv
 from torchrl_ecpo.envs.grouped import GroupedEnv
+from torchrl_ecpo.envs.readable import readable
 from torchrl_ecpo.envs.replay import EpisodeReplay
 
 __all__ = [
@@ -14,4 +15,5 @@ __all__ = [
     "EpisodeReplay",
     "GroupIdAllocator",
     "GroupedEnv",
+    "readable",
 ]
