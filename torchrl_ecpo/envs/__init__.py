@@ -5,6 +5,7 @@ from torchrl_ecpo.envs.algorithmic import TASKS, AlgorithmicEnv, AlgorithmicTask
 from torchrl_ecpo.envs.bandit import BanditEnv
 from torchrl_ecpo.envs.grouped import GroupedEnv
 from torchrl_ecpo.envs.replay import EpisodeReplay
+from torchrl_ecpo.envs.vector import VectorGroupedEnv, make_grouped_env
 
 __all__ = [
     "TASKS",
@@ -14,4 +15,6 @@ __all__ = [
     "EpisodeReplay",
     "GroupIdAllocator",
     "GroupedEnv",
+    "VectorGroupedEnv",
+    "make_grouped_env",
 ]

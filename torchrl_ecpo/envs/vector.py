@@ -1,0 +1,339 @@
+"""Groups over gymnasium: all copies in one vector environment, each started from its own seed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.envs.classic_control.cartpole import CartPoleEnv, CartPoleVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
+from torchrl.envs import EnvBase, GymWrapper
+
+from torchrl_ecpo.checks import (
+    check_count,
+    check_flag,
+    check_group_size,
+    check_integers,
+    check_real,
+    get_entry,
+)
+from torchrl_ecpo.envs._groups import SeededGroups
+from torchrl_ecpo.envs.grouped import GroupedEnv
+from torchrl_ecpo.groups import GROUP_KEY
+
+__all__ = ["VectorGroupedEnv", "make_grouped_env"]
+
+
+def make_grouped_env(
+    env: str | Callable[[], gym.Env | EnvBase],
+    *,
+    num_groups: int,
+    group_size: int,
+    parallel: bool = False,
+) -> VectorGroupedEnv | GroupedEnv:
+    """Groups of copies of an environment, in the fastest way that fits.
+
+    What is gymnasium's is played in one vector environment, :class:`VectorGroupedEnv`; any other
+    environment of TorchRL in :class:`GroupedEnv`. Seeds, starts and group ids are the same.
+
+    Args:
+        env: an id of gymnasium's, or what makes one copy, of gymnasium's class or of TorchRL's.
+        num_groups: `G`.
+        group_size: `K`, at least 2.
+        parallel: whether each copy runs in a process of its own. Default: False.
+
+    Raises:
+        TypeError: if `env` is or makes anything else.
+        ValueError: for an id that gymnasium does not know, and what the two classes refuse.
+
+    Examples:
+        >>> env = make_grouped_env("Acrobot-v1", num_groups=2, group_size=3)
+        >>> start = env.reset()
+        >>> start["observation"].shape, bool((start["observation"] == start["observation"][:, :1]).all())
+        (torch.Size([2, 3, 6]), True)
+        >>> from torchrl.envs import PendulumEnv
+        >>> type(make_grouped_env(PendulumEnv, num_groups=2, group_size=3)).__name__
+        'GroupedEnv'
+    """
+    sizes: Any = {"num_groups": num_groups, "group_size": group_size, "parallel": parallel}
+    if isinstance(env, str):
+        return VectorGroupedEnv(env, **sizes)
+    if isinstance(env, (gym.Env, EnvBase)) or not callable(env):
+        raise TypeError(
+            'env must be an id such as "CartPole-v1" or a function that makes a copy, got '
+            f"{env!r}."
+        )
+    copy = env()
+    copy.close()
+    make: Any = env
+    return (GroupedEnv if isinstance(copy, EnvBase) else VectorGroupedEnv)(make, **sizes)
+
+
+class VectorGroupedEnv(SeededGroups):
+    """:class:`GroupedEnv` over gymnasium's own vector environments, several times as fast.
+
+    Seeds, starts, group ids and the state that is saved are those of ``GroupedEnv`` over
+    ``GymEnv(..., categorical_action_encoding=True)``, and so are the entries: observations in the
+    dtype of their space, those of a ``Dict`` by their names, those of a ``Tuple`` as
+    ``("observation", "0")`` and so on; what is discrete as integers, ``Box`` without dimensions as
+    one number. Rewards are float32.
+
+    The copies are played in a ``SyncVectorEnv``, or with `parallel` in an ``AsyncVectorEnv``, by
+    ``AutoresetMode.DISABLED`` and reset masks. A copy that is over, or that ``"_step"`` leaves out,
+    is not stepped: it goes on showing its last observation, and earns nothing.
+
+    Of vector entry points CartPole's is taken, given its id: it can be told where each copy starts.
+    Its start and steps are those of ``CartPoleEnv`` to the last bits. Others draw all copies from
+    one generator, so that those of a group would differ; then a ``SyncVectorEnv`` is made.
+
+    Args:
+        env: an id of gymnasium's, or what makes a copy. A copy that needs arguments or wrappers
+            takes a function: ``lambda: FlattenObservation(gym.make("Taxi-v3"))``.
+        num_groups: `G`.
+        group_size: `K`, at least 2.
+        parallel: whether each copy runs in a process of its own. Default: False.
+
+    Raises:
+        TypeError: for a space that is not read, with the wrapper that mends it: of observations
+            ``Text``, ``Graph``, ``Sequence``, of actions ``Dict`` and ``Tuple`` too.
+        ValueError: for an id that gymnasium does not know, and the errors of ``GroupedEnv``.
+        RuntimeError: at a reset of everything, if the copies of a row do not start alike.
+
+    Examples:
+        >>> env = VectorGroupedEnv("CartPole-v1", num_groups=2, group_size=3)
+        >>> rollout = env.rollout(100, break_when_any_done=False)
+        >>> rollout["observation"].shape, rollout["group"].shape
+        (torch.Size([2, 3, 100, 4]), torch.Size([2, 3, 100]))
+    """
+
+    def __init__(
+        self,
+        env: str | Callable[[], gym.Env],
+        *,
+        num_groups: int,
+        group_size: int,
+        parallel: bool = False,
+    ) -> None:
+        """Make the environment; the class describes the arguments."""
+        rows = torch.Size([check_count("num_groups", num_groups), check_group_size(group_size)])
+        parallel = check_flag("parallel", parallel)
+        make: Any = partial(gym.make, env) if isinstance(env, str) else env
+        try:
+            one = make()
+        except gym.error.Error as error:
+            raise ValueError(f"env={env!r} is no task of gymnasium: {error}") from error
+        if not isinstance(one, gym.Env):
+            raise TypeError(f"env must make an environment of gymnasium, got {one!r}.")
+        one.close()
+        shown = _read_observation(one.observation_space)
+        action = _read_leaf("The action space", one.action_space, _ACTION_MEND)
+        super().__init__(batch_size=rows)
+        self._shown = shown.expand(rows)
+        self.observation_spec = self._shown.clone()
+        self.action_spec = action.expand(*rows, *action.shape)
+        self.reward_spec = Unbounded((*rows, 1), dtype=torch.float32)
+        flag = Categorical(2, (*rows, 1), dtype=torch.bool)
+        flags = {name: flag.clone() for name in ("done", "terminated", "truncated")}
+        self.done_spec = Composite(flags, shape=rows)
+        own = gym.spec("CartPole-v1").vector_entry_point
+        if isinstance(env, str) and not parallel and one.spec.vector_entry_point == own:
+            limit = {"max_episode_steps": one.spec.max_episode_steps}
+            vector = _SeededCartPole(rows.numel(), **limit, **one.spec.kwargs)
+        else:
+            batched = AsyncVectorEnv if parallel else SyncVectorEnv
+            copies = [partial(_Copy.make, make)] * rows.numel()
+            vector = batched(copies, autoreset_mode=AutoresetMode.DISABLED)
+        self._vector: Any = vector
+        self._ends = np.zeros((2, rows.numel()), dtype=bool)  # terminated, truncated
+        self._begin()
+
+    def _start(
+        self,
+        tensordict: TensorDictBase | None,
+        seeds: list[int | None],
+        options: dict[str, Any] | None = None,
+    ) -> TensorDictBase:
+        mask = np.array([seed is not None for seed in seeds])
+        if mask.any():
+            options = {**(options or {}), "reset_mask": mask}
+            self._seen, _ = self._vector.reset(seed=seeds, options=options)
+            self._ends[:, mask] = False
+        return self._output()
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        live = ~self._ends.any(0)
+        if (selected := tensordict.get("_step", None)) is not None:
+            live &= selected.reshape(-1).numpy(force=True)
+        actions = self._read_actions(get_entry(tensordict, "action"), live)
+        if not live.all():
+            actions = [one if goes else None for one, goes in zip(actions, live, strict=True)]
+        self._seen, reward, _, _, info = self._vector.step(actions)
+        if "terminated" in info:
+            self._ends |= [info["terminated"], info["truncated"]]
+        reward = torch.from_numpy((reward * live).astype(np.float32))
+        out = self._output().set("reward", reward.view(*self.batch_size, 1))
+        return self._add_group(out)
+
+    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
+        """What a step returns is complete, so that there is nothing to add."""
+        return next_tensordict_out
+
+    def _read_actions(self, action: Tensor, live: np.ndarray) -> Any:
+        """The actions `[G * K, *]` in the dtype of their space, legal where a copy is live."""
+        check_real("action", action)
+        batch, one = self._vector.action_space, self._vector.single_action_space
+        shape = self.full_action_spec["action"].shape
+        if action.shape != shape:
+            raise ValueError(f"'action' must have the shape {[*shape]}, got {[*action.shape]}.")
+        actions = action.numpy(force=True).reshape(batch.shape)
+        if isinstance(one, spaces.Box):
+            return actions.astype(one.dtype, copy=False)
+        check_integers("action", action)
+        actions = (actions.T * live).T.astype(one.dtype)
+        if not batch.contains(actions):
+            raise ValueError(f"'action' must be of {one}, got {actions.tolist()}.")
+        return actions
+
+    def _output(self) -> TensorDictBase:
+        """What a step or a reset returns; the arrays are not written to again."""
+        ends = torch.from_numpy(self._ends.copy()).view(2, *self.batch_size, 1)
+        is_root = isinstance(self._vector.single_observation_space, spaces.Dict)
+        seen = self._seen if is_root else {"observation": self._seen}
+        entries = _as_tensors(self._shown, seen)
+        entries |= {"terminated": ends[0], "truncated": ends[1], "done": ends.any(0)}
+        return TensorDict(entries, batch_size=self.batch_size, device=self.device)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Close the copies."""
+        super().close(raise_if_closed=raise_if_closed)
+        self._vector.close()
+
+
+class _Copy(gym.Wrapper):
+    """One copy: it waits where the action is None, and tells how it ended in its info alone.
+
+    So gymnasium's vector environments, which step all copies and under ``AutoresetMode.DISABLED``
+    none that is over, play those that go on and let the others wait.
+    """
+
+    @classmethod
+    def make(cls, make: Callable[[], gym.Env]) -> _Copy:
+        return cls(make())
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        self._seen, _ = self.env.reset(**kwargs)
+        return self._seen, {}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        if action is None:
+            return self._seen, 0.0, False, False, {}
+        self._seen, reward, terminated, truncated, _ = self.env.step(action)
+        ends = {"terminated": bool(terminated), "truncated": bool(truncated)}
+        return self._seen, reward, False, False, ends if any(ends.values()) else {}
+
+
+class _SeededCartPole(CartPoleVectorEnv):
+    """CartPole's vector entry point, by the rules of ``_Copy``; each copy has its own seed."""
+
+    def reset(self, *, seed: Any, options: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
+        if self.state is None:
+            super().reset()
+            self._single = CartPoleEnv()
+        starts = {}
+        mask = options.pop("reset_mask")
+        for copy in mask.nonzero()[0]:
+            if seed[copy] not in starts:
+                self._single.reset(seed=seed[copy], options=options)
+                starts[seed[copy]] = self._single.state
+            self.state[:, copy] = starts[seed[copy]]
+        self.steps[mask] = 0
+        return self._show(), {}
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        waits = np.array([one is None for one in action])
+        state, steps = self.state[:, waits], self.steps[waits]
+        moves = np.array([0 if one is None else one for one in action])
+        _, reward, terminated, truncated, _ = super().step(moves)
+        self.state[:, waits], self.steps[waits] = state, steps
+        self.prev_done[:] = False  # or it would reset by itself
+        ends = {"terminated": terminated & ~waits, "truncated": truncated & ~waits}
+        return self._show(), reward, None, None, ends
+
+    def _show(self) -> np.ndarray:
+        return np.ascontiguousarray(self.state.T, dtype=np.float32)
+
+
+_ACTION_MEND = "gymnasium.wrappers.TransformAction(env, func, action_space) can translate it"
+_MEND = "gymnasium.wrappers.TransformObservation(env, func, observation_space) can translate it"
+
+
+class _Spaces(gym.Env):
+    """What TorchRL's wrapper reads a space of."""
+
+    def __init__(self, space: gym.Space) -> None:
+        self.observation_space = self.action_space = space
+
+
+def _read_observation(space: gym.Space) -> Composite:
+    spec: Any = _read_space("The observation space", space, _MEND)
+    if not isinstance(space, spaces.Dict):
+        return Composite(observation=spec)
+    own = {"action", "reward", "done", "terminated", "truncated", GROUP_KEY}
+    if taken := own.intersection(spec.keys()):
+        raise ValueError(
+            f"The observation space has entries {sorted(taken)}, which an environment of TorchRL "
+            f"has itself: {_MEND}."
+        )
+    return spec
+
+
+def _read_space(name: str, space: gym.Space, mend: str) -> TensorSpec:
+    """The TorchRL spec of a space, those of its parts by their names or places."""
+    if isinstance(space, spaces.Dict):
+        parts = {}
+        for key, part in space.items():
+            others = [other for other in space if other != key]
+            own = f"gymnasium.wrappers.FilterObservation(env, {others}) leaves it out"
+            is_renamed = key == "state" and "observation" not in others  # as by GymEnv
+            key_here = "observation" if is_renamed else key
+            parts[key_here] = _read_space(f"{name}[{key!r}]", part, own)
+        return Composite(parts)
+    if isinstance(space, spaces.Tuple):
+        parts = {str(i): _read_space(f"{name}[{i}]", part, _MEND) for i, part in enumerate(space)}
+        return Composite(parts)
+    return _read_leaf(name, space, mend)
+
+
+def _read_leaf(name: str, space: gym.Space, mend: str) -> TensorSpec:
+    kinds = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+    if isinstance(space, kinds) and not np.any(getattr(space, "start", 0)):
+        try:
+            wrapper = GymWrapper(_Spaces(space), categorical_action_encoding=True)
+            return wrapper.action_spec
+        except (KeyError, TypeError, RuntimeError):  # of a dtype or shape that has no spec
+            pass
+    raise TypeError(
+        f"{name} must be Box, Discrete, MultiDiscrete or MultiBinary, counted from 0 and of a "
+        f"shape and dtype that TorchRL has a spec for, got {space}: {mend}."
+    )
+
+
+def _as_tensors(spec: Composite, seen: Any) -> dict[str, Any]:
+    """What a vector environment shows, as tensors ``[G, K, *]`` by the names of the spec."""
+    entries = {}
+    for key, own in spec.items():
+        part = seen[int(key)] if isinstance(seen, tuple) else seen.get(key, seen.get("state"))
+        entries[key] = (
+            TensorDict(_as_tensors(own, part), batch_size=spec.shape)
+            if isinstance(own, Composite)
+            else torch.from_numpy(part).view(own.shape)
+        )
+    return entries
