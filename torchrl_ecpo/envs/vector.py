@@ -12,9 +12,9 @@ import torch
 from gymnasium import spaces
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv, CartPoleVectorEnv
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector.utils import batch_space, iterate
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
-from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
+from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, GymWrapper
 
 from torchrl_ecpo.checks import (
@@ -57,8 +57,8 @@ def make_grouped_env(
     Examples:
         >>> env = make_grouped_env("Acrobot-v1", num_groups=2, group_size=3)
         >>> start = env.reset()
-        >>> start["observation"].shape, bool((start["observation"] == start["observation"][:, :1]).all())
-        (torch.Size([2, 3, 6]), True)
+        >>> start["observation"].shape, start["group"].shape
+        (torch.Size([2, 3, 6]), torch.Size([2, 3]))
         >>> from torchrl.envs import PendulumEnv
         >>> type(make_grouped_env(PendulumEnv, num_groups=2, group_size=3)).__name__
         'GroupedEnv'
@@ -68,8 +68,7 @@ def make_grouped_env(
         return VectorGroupedEnv(env, **sizes)
     if isinstance(env, (gym.Env, EnvBase)) or not callable(env):
         raise TypeError(
-            'env must be an id such as "CartPole-v1" or a function that makes a copy, got '
-            f"{env!r}."
+            f'env must be an id such as "CartPole-v1" or a function that makes a copy, got {env!r}.'
         )
     copy = env()
     copy.close()
@@ -133,16 +132,17 @@ class VectorGroupedEnv(SeededGroups):
         if not isinstance(one, gym.Env):
             raise TypeError(f"env must make an environment of gymnasium, got {one!r}.")
         one.close()
-        shown = _read_observation(one.observation_space)
-        action = _read_leaf("The action space", one.action_space, _ACTION_MEND)
+        shown = _read_root("observation", one.observation_space)
+        action = _read_root("action", one.action_space)
         super().__init__(batch_size=rows)
         self._shown = shown.expand(rows)
         self.observation_spec = self._shown.clone()
-        self.action_spec = action.expand(*rows, *action.shape)
+        self.full_action_spec = action.expand(rows)
         self.reward_spec = Unbounded((*rows, 1), dtype=torch.float32)
         flag = Categorical(2, (*rows, 1), dtype=torch.bool)
         flags = {name: flag.clone() for name in ("done", "terminated", "truncated")}
         self.done_spec = Composite(flags, shape=rows)
+        self._actions = batch_space(one.action_space, rows.numel())
         own = gym.spec("CartPole-v1").vector_entry_point
         if isinstance(env, str) and not parallel and one.spec.vector_entry_point == own:
             limit = {"max_episode_steps": one.spec.max_episode_steps}
@@ -172,10 +172,13 @@ class VectorGroupedEnv(SeededGroups):
         live = ~self._ends.any(0)
         if (selected := tensordict.get("_step", None)) is not None:
             live &= selected.reshape(-1).numpy(force=True)
-        actions = self._read_actions(get_entry(tensordict, "action"), live)
-        if not live.all():
-            actions = [one if goes else None for one, goes in zip(actions, live, strict=True)]
-        self._seen, reward, _, _, info = self._vector.step(actions)
+        entry, spec = tensordict, self.full_action_spec
+        if not isinstance(self._actions, spaces.Dict):
+            entry, spec = get_entry(tensordict, "action"), spec["action"]
+        actions = _as_arrays("action", spec, self._actions, entry, live)
+        each = zip(iterate(self._actions, actions), live.tolist(), strict=True)
+        given = [action if goes else None for action, goes in each]
+        self._seen, reward, _, _, info = self._vector.step(given)
         if "terminated" in info:
             self._ends |= [info["terminated"], info["truncated"]]
         reward = torch.from_numpy((reward * live).astype(np.float32))
@@ -186,29 +189,16 @@ class VectorGroupedEnv(SeededGroups):
         """What a step returns is complete, so that there is nothing to add."""
         return next_tensordict_out
 
-    def _read_actions(self, action: Tensor, live: np.ndarray) -> Any:
-        """The actions `[G * K, *]` in the dtype of their space, legal where a copy is live."""
-        check_real("action", action)
-        batch, one = self._vector.action_space, self._vector.single_action_space
-        shape = self.full_action_spec["action"].shape
-        if action.shape != shape:
-            raise ValueError(f"'action' must have the shape {[*shape]}, got {[*action.shape]}.")
-        actions = action.numpy(force=True).reshape(batch.shape)
-        if isinstance(one, spaces.Box):
-            return actions.astype(one.dtype, copy=False)
-        check_integers("action", action)
-        actions = (actions.T * live).T.astype(one.dtype)
-        if not batch.contains(actions):
-            raise ValueError(f"'action' must be of {one}, got {actions.tolist()}.")
-        return actions
-
     def _output(self) -> TensorDictBase:
         """What a step or a reset returns; the arrays are not written to again."""
         ends = torch.from_numpy(self._ends.copy()).view(2, *self.batch_size, 1)
-        is_root = isinstance(self._vector.single_observation_space, spaces.Dict)
-        seen = self._seen if is_root else {"observation": self._seen}
-        entries = _as_tensors(self._shown, seen)
-        entries |= {"terminated": ends[0], "truncated": ends[1], "done": ends.any(0)}
+        entries = {"terminated": ends[0], "truncated": ends[1], "done": ends.any(0)}
+        space = self._vector.single_observation_space
+        if isinstance(space, spaces.Dict):
+            entries |= _as_tensors(self._shown, space, self._seen)
+        else:
+            for key, spec in self._shown.items():  # of which there is one
+                entries[key] = _as_tensors(spec, space, self._seen)
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
@@ -223,6 +213,10 @@ class _Copy(gym.Wrapper):
     So gymnasium's vector environments, which step all copies and under ``AutoresetMode.DISABLED``
     none that is over, play those that go on and let the others wait.
     """
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.action_space = spaces.Discrete(1)  # of which a batch may be any list
 
     @classmethod
     def make(cls, make: Callable[[], gym.Env]) -> _Copy:
@@ -271,10 +265,6 @@ class _SeededCartPole(CartPoleVectorEnv):
         return np.ascontiguousarray(self.state.T, dtype=np.float32)
 
 
-_ACTION_MEND = "gymnasium.wrappers.TransformAction(env, func, action_space) can translate it"
-_MEND = "gymnasium.wrappers.TransformObservation(env, func, observation_space) can translate it"
-
-
 class _Spaces(gym.Env):
     """What TorchRL's wrapper reads a space of."""
 
@@ -282,58 +272,82 @@ class _Spaces(gym.Env):
         self.observation_space = self.action_space = space
 
 
-def _read_observation(space: gym.Space) -> Composite:
-    spec: Any = _read_space("The observation space", space, _MEND)
+_MENDS = {
+    "observation": "gymnasium.wrappers.FilterObservation leaves out entries of a Dict, and "
+    "TransformObservation translates others",
+    "action": "gymnasium.wrappers.TransformAction translates it",
+}
+
+
+def _parts(space: Any) -> list[tuple[Any, str, gym.Space]]:
+    """The parts of a Dict or a Tuple: their keys, what TorchRL calls them, and their spaces."""
+    if isinstance(space, spaces.Tuple):
+        return [(i, str(i), part) for i, part in enumerate(space.spaces)]
     if not isinstance(space, spaces.Dict):
-        return Composite(observation=spec)
-    own = {"action", "reward", "done", "terminated", "truncated", GROUP_KEY}
-    if taken := own.intersection(spec.keys()):
+        return []
+    names = {key: key for key in space.spaces}
+    if "state" in names and "observation" not in names:
+        names["state"] = "observation"  # as by GymEnv
+    return [(key, names[key], part) for key, part in space.items()]
+
+
+def _read_root(root: str, space: gym.Space) -> Composite:
+    """The TorchRL spec of a space, by its parts' own names if it is a Dict."""
+    spec = _read_space(root, root, space)
+    if not isinstance(space, spaces.Dict):
+        is_box = isinstance(space, spaces.Box) and root == "observation"
+        is_picture = is_box and GymWrapper(_Spaces(space)).from_pixels
+        return Composite({"pixels" if is_picture else root: spec})
+    own = {"reward", "done", "terminated", "truncated", GROUP_KEY}
+    if taken := (own | ({"action"} - {root})).intersection(spec.keys()):
         raise ValueError(
-            f"The observation space has entries {sorted(taken)}, which an environment of TorchRL "
-            f"has itself: {_MEND}."
+            f"The {root} space has entries {sorted(taken)}, which an environment of TorchRL has "
+            f"itself. {_MENDS[root]}."
         )
     return spec
 
 
-def _read_space(name: str, space: gym.Space, mend: str) -> TensorSpec:
-    """The TorchRL spec of a space, those of its parts by their names or places."""
-    if isinstance(space, spaces.Dict):
-        parts = {}
-        for key, part in space.items():
-            others = [other for other in space if other != key]
-            own = f"gymnasium.wrappers.FilterObservation(env, {others}) leaves it out"
-            is_renamed = key == "state" and "observation" not in others  # as by GymEnv
-            key_here = "observation" if is_renamed else key
-            parts[key_here] = _read_space(f"{name}[{key!r}]", part, own)
-        return Composite(parts)
-    if isinstance(space, spaces.Tuple):
-        parts = {str(i): _read_space(f"{name}[{i}]", part, _MEND) for i, part in enumerate(space)}
-        return Composite(parts)
-    return _read_leaf(name, space, mend)
-
-
-def _read_leaf(name: str, space: gym.Space, mend: str) -> TensorSpec:
+def _read_space(root: str, name: str, space: gym.Space) -> Any:
+    if parts := _parts(space):
+        return Composite(
+            {own: _read_space(root, f"{name}[{key!r}]", part) for key, own, part in parts}
+        )
     kinds = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
     if isinstance(space, kinds) and not np.any(getattr(space, "start", 0)):
         try:
-            wrapper = GymWrapper(_Spaces(space), categorical_action_encoding=True)
-            return wrapper.action_spec
-        except (KeyError, TypeError, RuntimeError):  # of a dtype or shape that has no spec
+            return GymWrapper(_Spaces(space), categorical_action_encoding=True).action_spec
+        except (KeyError, TypeError, RuntimeError):  # TorchRL has no spec of the dtype or the shape
             pass
     raise TypeError(
-        f"{name} must be Box, Discrete, MultiDiscrete or MultiBinary, counted from 0 and of a "
-        f"shape and dtype that TorchRL has a spec for, got {space}: {mend}."
+        f"The space of {name} must be Box, Discrete, MultiDiscrete or MultiBinary, counted from 0, "
+        f"or Dict or Tuple of these, got {space}, which TorchRL does not read. {_MENDS[root]}."
     )
 
 
-def _as_tensors(spec: Composite, seen: Any) -> dict[str, Any]:
-    """What a vector environment shows, as tensors ``[G, K, *]`` by the names of the spec."""
-    entries = {}
-    for key, own in spec.items():
-        part = seen[int(key)] if isinstance(seen, tuple) else seen.get(key, seen.get("state"))
-        entries[key] = (
-            TensorDict(_as_tensors(own, part), batch_size=spec.shape)
-            if isinstance(own, Composite)
-            else torch.from_numpy(part).view(own.shape)
-        )
-    return entries
+def _as_tensors(spec: Any, space: gym.Space, seen: Any) -> Any:
+    """What a vector environment shows, as tensors ``[G, K, *]``."""
+    parts = _parts(space)
+    if not parts:
+        return torch.from_numpy(seen).view(spec.shape)
+    return {own: _as_tensors(spec[own], part, seen[key]) for key, own, part in parts}
+
+
+def _as_arrays(name: str, spec: Any, space: Any, entry: Any, live: np.ndarray) -> Any:
+    """Actions as arrays ``[G * K, *]`` of a batched space, with 0 for copies that are not live."""
+    if parts := _parts(space):
+        arrays = {
+            key: _as_arrays(own, spec[own], part, get_entry(entry, own), live)
+            for key, own, part in parts
+        }
+        return arrays if isinstance(space, spaces.Dict) else tuple(arrays.values())
+    check_real(name, entry)
+    if entry.shape != spec.shape:
+        raise ValueError(f"{name!r} must have the shape {[*spec.shape]}, got {[*entry.shape]}.")
+    array = entry.numpy(force=True).reshape(space.shape)
+    if np.issubdtype(space.dtype, np.floating):
+        return array.astype(space.dtype, copy=False)
+    check_integers(name, entry)
+    array = (array.T * live).T.astype(space.dtype)
+    if not space.contains(array):
+        raise ValueError(f"{name!r} must be of {space}, got {array.tolist()}.")
+    return array
