@@ -124,7 +124,7 @@ class SeededGroups(EnvBase):
     def _start(
         self, tensordict: TensorDictBase | None, seeds: list[int | None], **kwargs: Any
     ) -> TensorDictBase:
-        """Reset the copies that have a seed, and return what all of them show.
+        """Reset the copies that have a seed, and return what all of them show, and their groups.
 
         Args:
             tensordict: what `reset` was given if some of the copies go on. None: all have a seed.
@@ -173,7 +173,7 @@ class SeededGroups(EnvBase):
         out = self._start(tensordict, seeds, **kwargs)
         if mask is None:
             self._check_alike(out)
-        return self._add_group(out)
+        return out
 
     def _check_alike(self, start: TensorDictBase) -> None:
         for key in self.full_observation_spec.keys(True, True):

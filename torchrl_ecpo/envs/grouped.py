@@ -110,7 +110,8 @@ class GroupedEnv(SeededGroups):
     ) -> TensorDictBase:
         options = [kwargs if seed is None else {**kwargs, "seed": seed} for seed in seeds]
         flat = None if tensordict is None else tensordict.reshape(-1)
-        return self.copies.reset(flat, list_of_kwargs=options).reshape(self.batch_size)
+        out = self.copies.reset(flat, list_of_kwargs=options)
+        return self._add_group(out.reshape(self.batch_size))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         for key in self.action_keys:

@@ -22,6 +22,7 @@ from torchrl_ecpo.checks import (
     check_flag,
     check_group_size,
     check_integers,
+    check_kind,
     check_real,
     get_entry,
 )
@@ -70,7 +71,8 @@ def make_grouped_env(
         raise TypeError(
             f'env must be an id such as "CartPole-v1" or a function that makes a copy, got {env!r}.'
         )
-    copy = env()
+    copy: Any = env()
+    check_kind("What env makes", copy, gym.Env, EnvBase)
     copy.close()
     make: Any = env
     return (GroupedEnv if isinstance(copy, EnvBase) else VectorGroupedEnv)(make, **sizes)
@@ -129,8 +131,7 @@ class VectorGroupedEnv(SeededGroups):
             one = make()
         except gym.error.Error as error:
             raise ValueError(f"env={env!r} is no task of gymnasium: {error}") from error
-        if not isinstance(one, gym.Env):
-            raise TypeError(f"env must make an environment of gymnasium, got {one!r}.")
+        check_kind("What env makes", one, gym.Env)
         one.close()
         shown = _read_root("observation", one.observation_space)
         action = _read_root("action", one.action_space)
@@ -176,23 +177,26 @@ class VectorGroupedEnv(SeededGroups):
         if not isinstance(self._actions, spaces.Dict):
             entry, spec = get_entry(tensordict, "action"), spec["action"]
         actions = _as_arrays("action", spec, self._actions, entry, live)
-        each = zip(iterate(self._actions, actions), live.tolist(), strict=True)
-        given = [action if goes else None for action, goes in each]
-        self._seen, reward, _, _, info = self._vector.step(given)
+        if isinstance(self._vector, _SeededCartPole):
+            self._vector.live = live
+        else:
+            each = zip(iterate(self._actions, actions), live.tolist(), strict=True)
+            actions = [action if goes else None for action, goes in each]
+        self._seen, reward, _, _, info = self._vector.step(actions)
         if "terminated" in info:
             self._ends |= [info["terminated"], info["truncated"]]
-        reward = torch.from_numpy((reward * live).astype(np.float32))
-        out = self._output().set("reward", reward.view(*self.batch_size, 1))
-        return self._add_group(out)
+        reward = torch.from_numpy(np.multiply(reward, live, dtype=np.float32))
+        return self._output(reward=reward.view(*self.batch_size, 1))
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         """What a step returns is complete, so that there is nothing to add."""
         return next_tensordict_out
 
-    def _output(self) -> TensorDictBase:
+    def _output(self, **entries: Any) -> TensorDictBase:
         """What a step or a reset returns; the arrays are not written to again."""
         ends = torch.from_numpy(self._ends.copy()).view(2, *self.batch_size, 1)
-        entries = {"terminated": ends[0], "truncated": ends[1], "done": ends.any(0)}
+        entries |= {"terminated": ends[0], "truncated": ends[1], "done": ends[0] | ends[1]}
+        entries[GROUP_KEY] = self._group.clone()
         space = self._vector.single_observation_space
         if isinstance(space, spaces.Dict):
             entries |= _as_tensors(self._shown, space, self._seen)
@@ -230,12 +234,15 @@ class _Copy(gym.Wrapper):
         if action is None:
             return self._seen, 0.0, False, False, {}
         self._seen, reward, terminated, truncated, _ = self.env.step(action)
-        ends = {"terminated": bool(terminated), "truncated": bool(truncated)}
-        return self._seen, reward, False, False, ends if any(ends.values()) else {}
+        is_over = terminated or truncated
+        ends = {"terminated": bool(terminated), "truncated": bool(truncated)} if is_over else {}
+        return self._seen, reward, False, False, ends
 
 
 class _SeededCartPole(CartPoleVectorEnv):
-    """CartPole's vector entry point, by the rules of ``_Copy``; each copy has its own seed."""
+    """CartPole's vector entry point: each copy has its own seed, and moves if it is `live`."""
+
+    live: np.ndarray
 
     def reset(self, *, seed: Any, options: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         if self.state is None:
@@ -252,13 +259,12 @@ class _SeededCartPole(CartPoleVectorEnv):
         return self._show(), {}
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        waits = np.array([one is None for one in action])
+        waits = ~self.live
         state, steps = self.state[:, waits], self.steps[waits]
-        moves = np.array([0 if one is None else one for one in action])
-        _, reward, terminated, truncated, _ = super().step(moves)
+        _, reward, terminated, truncated, _ = super().step(action)
         self.state[:, waits], self.steps[waits] = state, steps
         self.prev_done[:] = False  # or it would reset by itself
-        ends = {"terminated": terminated & ~waits, "truncated": truncated & ~waits}
+        ends = {"terminated": terminated & self.live, "truncated": truncated & self.live}
         return self._show(), reward, None, None, ends
 
     def _show(self) -> np.ndarray:
