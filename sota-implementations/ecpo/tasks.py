@@ -40,7 +40,7 @@ from torchrl.modules import (
 )
 
 from torchrl_ecpo.collectors import TrajectoryGroupCollector
-from torchrl_ecpo.envs import AlgorithmicEnv, BanditEnv, EpisodeReplay, GroupedEnv
+from torchrl_ecpo.envs import AlgorithmicEnv, BanditEnv, EpisodeReplay, make_grouped_env
 from torchrl_ecpo.modules import SharedCategorical, make_softmax_policy, make_tuple_policy
 
 EVALUATION_EPISODES = 100
@@ -194,7 +194,8 @@ def make_gym(config: DictConfig) -> Task:
         return TransformedEnv(env, Compose(*transforms))
 
     def make_env(num_groups: int) -> EnvBase:
-        return limited(GroupedEnv(make_copy, num_groups=num_groups, group_size=config.group_size))
+        sizes = {"num_groups": num_groups, "group_size": config.group_size}
+        return limited(make_grouped_env(config.env.name, **sizes))
 
     copies = SerialEnv(10, make_evaluation_copy)
     env, evaluation_env = make_env(config.num_groups), limited(copies)
