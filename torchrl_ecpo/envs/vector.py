@@ -103,9 +103,9 @@ class VectorGroupedEnv(SeededGroups):
         parallel: whether each copy runs in a process of its own. Default: False.
 
     Raises:
-        TypeError: for a space that is not read, with the wrapper that mends it: of observations
-            ``Text``, ``Graph``, ``Sequence``, of actions ``Dict`` and ``Tuple`` too.
-        ValueError: for an id that gymnasium does not know, and the errors of ``GroupedEnv``.
+        TypeError: if `env` makes anything else, and for a space that is not read (``Text``,
+            ``Graph``, ``Sequence``), with the wrapper that mends it.
+        ValueError: for an id that gymnasium does not know, and for numbers as in ``GroupedEnv``.
         RuntimeError: at a reset of everything, if the copies of a row do not start alike.
 
     Examples:
@@ -126,7 +126,9 @@ class VectorGroupedEnv(SeededGroups):
         """Make the environment; the class describes the arguments."""
         rows = torch.Size([check_count("num_groups", num_groups), check_group_size(group_size)])
         parallel = check_flag("parallel", parallel)
-        make: Any = partial(gym.make, env) if isinstance(env, str) else env
+        make: Any = env
+        if isinstance(env, str):
+            make = partial(gym.make, env, disable_env_checker=True)  # as GymEnv does
         try:
             one = make()
         except gym.error.Error as error:
@@ -139,20 +141,20 @@ class VectorGroupedEnv(SeededGroups):
         self._shown = shown.expand(rows)
         self.observation_spec = self._shown.clone()
         self.full_action_spec = action.expand(rows)
-        self.reward_spec = Unbounded((*rows, 1), dtype=torch.float32)
-        flag = Categorical(2, (*rows, 1), dtype=torch.bool)
+        column = torch.Size([*rows, 1])
+        self.reward_spec = Unbounded(column, dtype=torch.float32)
+        flag = Categorical(2, column, dtype=torch.bool)
         flags = {name: flag.clone() for name in ("done", "terminated", "truncated")}
         self.done_spec = Composite(flags, shape=rows)
         self._actions = batch_space(one.action_space, rows.numel())
-        own = gym.spec("CartPole-v1").vector_entry_point
-        if isinstance(env, str) and not parallel and one.spec.vector_entry_point == own:
-            limit = {"max_episode_steps": one.spec.max_episode_steps}
-            vector = _SeededCartPole(rows.numel(), **limit, **one.spec.kwargs)
+        self._vector: Any
+        if isinstance(env, str) and not parallel and _is_plain_cartpole(one.spec):
+            limit = one.spec.max_episode_steps
+            self._vector = _SeededCartPole(rows.numel(), limit, **one.spec.kwargs)
         else:
             batched = AsyncVectorEnv if parallel else SyncVectorEnv
-            copies = [partial(_Copy.make, make)] * rows.numel()
-            vector = batched(copies, autoreset_mode=AutoresetMode.DISABLED)
-        self._vector: Any = vector
+            copies = [lambda: _Copy(make())] * rows.numel()
+            self._vector = batched(copies, autoreset_mode=AutoresetMode.DISABLED)
         self._ends = np.zeros((2, rows.numel()), dtype=bool)  # terminated, truncated
         self._begin()
 
@@ -170,7 +172,7 @@ class VectorGroupedEnv(SeededGroups):
         return self._output()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        live = ~self._ends.any(0)
+        live: Any = ~self._ends.any(0)
         if (selected := tensordict.get("_step", None)) is not None:
             live &= selected.reshape(-1).numpy(force=True)
         entry, spec = tensordict, self.full_action_spec
@@ -192,8 +194,9 @@ class VectorGroupedEnv(SeededGroups):
         """What a step returns is complete, so that there is nothing to add."""
         return next_tensordict_out
 
-    def _output(self, **entries: Any) -> TensorDictBase:
+    def _output(self, **others: Any) -> TensorDictBase:
         """What a step or a reset returns; the arrays are not written to again."""
+        entries: dict[Any, Any] = others
         ends = torch.from_numpy(self._ends.copy()).view(2, *self.batch_size, 1)
         entries |= {"terminated": ends[0], "truncated": ends[1], "done": ends[0] | ends[1]}
         entries[GROUP_KEY] = self._group.clone()
@@ -222,10 +225,6 @@ class _Copy(gym.Wrapper):
         super().__init__(env)
         self.action_space = spaces.Discrete(1)  # of which a batch may be any list
 
-    @classmethod
-    def make(cls, make: Callable[[], gym.Env]) -> _Copy:
-        return cls(make())
-
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         self._seen, _ = self.env.reset(**kwargs)
         return self._seen, {}
@@ -239,15 +238,23 @@ class _Copy(gym.Wrapper):
         return self._seen, reward, False, False, ends
 
 
+def _is_plain_cartpole(spec: Any) -> bool:
+    """Whether gymnasium's vector entry point of CartPole is the whole task."""
+    own = gym.spec("CartPole-v1").vector_entry_point
+    has_limit = spec.max_episode_steps is not None  # or the entry point has one of its own
+    return spec.vector_entry_point == own and has_limit and not spec.additional_wrappers
+
+
 class _SeededCartPole(CartPoleVectorEnv):
     """CartPole's vector entry point: each copy has its own seed, and moves if it is `live`."""
 
     live: np.ndarray
+    state: Any
 
     def reset(self, *, seed: Any, options: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
-        if self.state is None:
-            super().reset()
+        if not hasattr(self, "_single"):
             self._single = CartPoleEnv()
+            super().reset()  # which makes the arrays
         starts = {}
         mask = options.pop("reset_mask")
         for copy in mask.nonzero()[0]:
@@ -353,7 +360,8 @@ def _as_arrays(name: str, spec: Any, space: Any, entry: Any, live: np.ndarray) -
     if np.issubdtype(space.dtype, np.floating):
         return array.astype(space.dtype, copy=False)
     check_integers(name, entry)
-    array = (array.T * live).T.astype(space.dtype)
+    array = array.astype(space.dtype)
+    array[~live] = 0
     if not space.contains(array):
         raise ValueError(f"{name!r} must be of {space}, got {array.tolist()}.")
     return array
