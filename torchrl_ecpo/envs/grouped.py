@@ -25,6 +25,9 @@ class GroupedEnv(SeededGroups):
     and carries the same integer ``"group"``, whether the copies are reset together or each at its
     own time. A reset of everything starts a new instance in every row.
 
+    Copies of gymnasium's are played several times as fast by
+    :func:`~torchrl_ecpo.envs.make_grouped_env`.
+
     Wrap it in the transforms that count or sum (``StepCounter(max_steps=...)``, ``RewardSum()``,
     ``InitTracker()``, ``DoubleToFloat()``) like any other environment.
 
