@@ -366,10 +366,11 @@ def test_episodes_that_are_over_are_forgotten(make):
 
     tracemalloc.start()
     try:
-        episodes(300)  # until Python and torch have the blocks that they use again
+        episodes(10)
         before = kept()
-        episodes(100)
-        assert kept() - before < 1000
+        episodes(500)
+        # Of two copies; some 3 kB come and go with torch's own objects.
+        assert (kept() - before) / (2 * 500) < 5, "bytes an episode"
     finally:
         tracemalloc.stop()
     env.close()
