@@ -40,7 +40,13 @@ from torchrl.modules import (
 )
 
 from torchrl_ecpo.collectors import TrajectoryGroupCollector
-from torchrl_ecpo.envs import AlgorithmicEnv, BanditEnv, EpisodeReplay, GroupedEnv, readable
+from torchrl_ecpo.envs import (
+    AlgorithmicEnv,
+    BanditEnv,
+    EpisodeReplay,
+    make_grouped_env,
+    readable,
+)
 from torchrl_ecpo.modules import (
     PixelEncoder,
     SharedCategorical,
@@ -183,10 +189,10 @@ class Evaluation(nn.Module):
         }
 
 
-def make_copy(name: str) -> gym.Env:
-    """A task of gymnasium, with spaces that the policy can read and play."""
+def make_raw_copy(name: str) -> gym.Env:
+    """A task of gymnasium, as it is."""
     try:
-        return readable(gym.make(name, disable_env_checker=True))
+        return gym.make(name, disable_env_checker=True)
     except (gym.error.DependencyNotInstalled, ModuleNotFoundError) as error:
         raise ValueError(f"env.name={name} needs what is not installed: {error}") from error
     except gym.error.Error as error:
@@ -194,6 +200,12 @@ def make_copy(name: str) -> gym.Env:
             f"env.name={name} is no task of gymnasium: {error} If another module registers it, "
             "name that too: env.name=module:Task-v0."
         ) from error
+
+
+def make_copy(name: str) -> gym.Env:
+    """A task of gymnasium, with spaces that the policy can read and play."""
+    try:
+        return readable(make_raw_copy(name))
     except ValueError as error:
         raise ValueError(f"env.name: {error}") from error
 
@@ -211,9 +223,13 @@ def make_gym(config: DictConfig) -> Task:
         transforms: list[Any] = [DoubleToFloat(), StepCounter(config.env.max_steps)]
         return TransformedEnv(env, Compose(*transforms))
 
+    # By its id a task is played by its own vector entry point, if that can be.
+    raw = make_raw_copy(config.env.name)
+    source: Any = config.env.name if readable(raw) is raw else partial(make_copy, config.env.name)
+
     def make_env(num_groups: int) -> EnvBase:
-        grouped = GroupedEnv(make_torchrl_copy, num_groups=num_groups, group_size=config.group_size)
-        return limited(grouped)
+        sizes = {"num_groups": num_groups, "group_size": config.group_size}
+        return limited(make_grouped_env(source, **sizes))
 
     copies = SerialEnv(10, make_evaluation_copy)
     env, evaluation_env = make_env(config.num_groups), limited(copies)
