@@ -83,9 +83,8 @@ class LearningRates(TrainerHookBase):
             owner = parameter_name.split(".")[0].removesuffix("_params")
             learned.setdefault(owner, []).append(parameter)
         if unknown := self.rates.keys() - learned.keys():
-            raise ValueError(
-                f"LearningRates names {min(unknown)}; the loss learns {', '.join(learned)}."
-            )
+            known = ", ".join(sorted(learned))
+            raise ValueError(f"LearningRates names {min(unknown)}; the loss learns {known}.")
         optimizer = trainer.optimizer
         moved = {id(parameter) for owner in self.rates for parameter in learned[owner]}
         for group in optimizer.param_groups:
