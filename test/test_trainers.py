@@ -178,6 +178,9 @@ def test_wrong_learning_rates_are_refused():
         trainers.LearningRates(log_tau="fast")
     with pytest.raises(ValueError, match="log_tau must be at least 0, got -1"):
         trainers.LearningRates(log_tau=-1)
+    trainer.optimizer = None
+    with pytest.raises(ValueError, match="needs a trainer with an optimizer="):
+        trainers.LearningRates(log_tau=0.1).register(trainer)
 
 
 @pytest.mark.filterwarnings("ignore:SACTrainer is an experimental", "ignore:.*OptimizationStepper")

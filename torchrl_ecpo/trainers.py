@@ -63,7 +63,7 @@ class LearningRates(TrainerHookBase):
 
     Raises:
         ValueError: for a rate that is no number of at least 0 and, when registered, for a name of
-            nothing that the loss learns.
+            nothing that the loss learns, or without an optimiser.
 
     Examples:
         >>> LearningRates(log_tau=1e-2, actor_network=1e-3).rates
@@ -78,6 +78,9 @@ class LearningRates(TrainerHookBase):
 
     def register(self, trainer: Trainer, name: str = "learning_rates") -> None:
         """Regroup the parameters of the trainer's optimiser."""
+        optimizer = trainer.optimizer
+        if optimizer is None:
+            raise ValueError("LearningRates needs a trainer with an optimizer=, which it regroups.")
         learned: dict[str, list[Any]] = {}
         for parameter_name, parameter in trainer.loss_module.named_parameters():
             owner = parameter_name.split(".")[0].removesuffix("_params")
@@ -85,7 +88,6 @@ class LearningRates(TrainerHookBase):
         if unknown := self.rates.keys() - learned.keys():
             known = ", ".join(sorted(learned))
             raise ValueError(f"LearningRates names {min(unknown)}; the loss learns {known}.")
-        optimizer = trainer.optimizer
         moved = {id(parameter) for owner in self.rates for parameter in learned[owner]}
         for group in optimizer.param_groups:
             group["params"] = [one for one in group["params"] if id(one) not in moved]
