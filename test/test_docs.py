@@ -123,7 +123,7 @@ EXAMPLES = [
 
 
 @pytest.mark.parametrize("page", EXAMPLES, ids=name)
-def test_examples_run(page, tmp_path, monkeypatch):
+def test_examples_run(page, tmp_path, monkeypatch, torchrl_configs):
     # As from the repository, but what they write stays out of it.
     for folder in ("docs", "sota-implementations"):
         (tmp_path / folder).symlink_to(ROOT / folder)

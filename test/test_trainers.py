@@ -29,6 +29,7 @@ import torchrl_ecpo
 from torchrl_ecpo import ActorCriticLoss, ECACLoss, TrustPCLLoss, trainers
 from torchrl_ecpo.modules import make_qvalue_network, make_tanh_gaussian_actor
 
+pytestmark = pytest.mark.usefixtures("torchrl_configs")
 ROOT = Path(__file__).parents[1]
 LOSSES = [
     getattr(torchrl_ecpo, name)
