@@ -177,8 +177,9 @@ def test_wrong_learning_rates_are_refused():
         trainers.LearningRates(log_alpha=0.1).register(trainer)
     with pytest.raises(ValueError, match="log_tau must be a number, got 'fast'"):
         trainers.LearningRates(log_tau="fast")
-    with pytest.raises(ValueError, match="log_tau must be at least 0, got -1"):
-        trainers.LearningRates(log_tau=-1)
+    for rate in (-1, float("inf"), float("nan")):
+        with pytest.raises(ValueError, match=f"log_tau must be finite and >= 0, got {rate}"):
+            trainers.LearningRates(log_tau=rate)
     trainer.optimizer = None
     with pytest.raises(ValueError, match="needs a trainer with an optimizer="):
         trainers.LearningRates(log_tau=0.1).register(trainer)

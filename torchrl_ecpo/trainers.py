@@ -18,6 +18,7 @@ Examples:
 from __future__ import annotations
 
 import inspect
+import math
 from dataclasses import field, make_dataclass
 from typing import Any
 
@@ -62,7 +63,7 @@ class LearningRates(TrainerHookBase):
         rates: the rate of what is named: ``log_tau``, ``actor_network``, ``qvalue_network``, ...
 
     Raises:
-        ValueError: for a rate that is no number of at least 0 and, when registered, for a name of
+        ValueError: for a rate that is no finite number >= 0 and, when registered, for a name of
             nothing that the loss learns, or without an optimiser.
 
     Examples:
@@ -73,8 +74,8 @@ class LearningRates(TrainerHookBase):
     def __init__(self, **rates: float) -> None:
         self.rates = {name: as_float(name, rate) for name, rate in rates.items()}
         for name, rate in self.rates.items():
-            if not rate >= 0:
-                raise ValueError(f"The learning rate {name} must be at least 0, got {rate}.")
+            if not 0 <= rate < math.inf:
+                raise ValueError(f"The learning rate {name} must be finite and >= 0, got {rate}.")
 
     def register(self, trainer: Trainer, name: str = "learning_rates") -> None:
         """Regroup the parameters of the trainer's optimiser."""
