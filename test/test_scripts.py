@@ -29,7 +29,7 @@ def start(directory, *overrides, afresh=False):
     flags = [override for override in overrides if override.startswith("--")]
     options = [override for override in overrides if override not in flags]
     tiny = () if any(option.startswith("env=") for option in options) else TINY
-    afresh = afresh or "collector=ray" in options or "hydra/launcher=joblib" in options
+    afresh = afresh or "collector=ray" in options or "hydra/launcher" in " ".join(options)
     return run_script(directory, ECPO, *flags, *tiny, *options, afresh=afresh)
 
 
@@ -167,12 +167,18 @@ def test_a_run_stops_once_it_holds_its_goal_and_is_finished(tmp_path):
 
 
 @pytest.mark.slow  # each of the two processes imports torch
-def test_a_sweep_over_two_processes_gives_the_metrics_of_single_runs(sweep, tmp_path):
+@pytest.mark.parametrize(
+    "launcher", [("joblib", "hydra.launcher.n_jobs=2"), ("submitit_local",)], ids=lambda own: own[0]
+)
+def test_a_sweep_over_two_processes_gives_the_metrics_of_single_runs(
+    sweep, tmp_path, monkeypatch, launcher
+):
+    monkeypatch.setenv("PYTHONPATH", str(ECPO.parent), prepend=os.pathsep)  # for submitit
     run_ecpo(
         tmp_path,
         "--multirun",
-        "hydra/launcher=joblib",
-        "hydra.launcher.n_jobs=2",
+        f"hydra/launcher={launcher[0]}",
+        *launcher[1:],
         "loss=ecpo,ment",
         "form=paper",
         "seed=5",
