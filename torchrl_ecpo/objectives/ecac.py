@@ -4,20 +4,30 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+import torch
+from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from torch import Tensor
+from torch.distributions import Distribution
 
-from torchrl_ecpo.checks import check_choice, check_count
+from torchrl_ecpo.checks import as_fraction, check_choice, check_count
 from torchrl_ecpo.functional import (
     Surrogate,
     centred_gaussian_projection,
+    gaussian_cross_entropy,
+    lifted_gaussian_moments,
     mean_seeking_projection,
 )
-from torchrl_ecpo.objectives.actions import SampledActions, gaussian_parameters
-from torchrl_ecpo.objectives.actor_critic import ActorCriticLoss, States
+from torchrl_ecpo.objectives.actions import PairedActions, SampledActions, gaussian_parameters
+from torchrl_ecpo.objectives.actor_critic import ActorCriticLoss, Lift, States
 
 __all__ = ["DiscreteECACLoss", "ECACLoss"]
 
-PROJECTIONS = ("centred", "paper")
+PROJECTIONS = ("centred", "paper", "gradient")
+NO_SLOPE = (
+    'projection="gradient" needs a qvalue_network that is differentiable in the action, but no '
+    'gradient comes back through this one: mend it, or take projection="centred".'
+)
 
 
 class ECACLoss(ActorCriticLoss):
@@ -135,26 +145,94 @@ class ECACLoss(ActorCriticLoss):
         qvalue_network: TensorDictModule | list[TensorDictModule],
         value_network: TensorDictModule | None = None,
         *,
-        projection: Literal["centred", "paper"] = "centred",
+        projection: Literal["centred", "paper", "gradient"] = "centred",
+        width_entropy: float = 1.0,
         num_action_samples: int = 8,
         **options: Any,
     ) -> None:
         check_choice("projection", projection, PROJECTIONS)
+        is_paired = projection == "gradient"
+        width_entropy = as_fraction("width_entropy", width_entropy)
+        if width_entropy != 1 and not is_paired:
+            raise ValueError(
+                'width_entropy is an option of projection="gradient", which has the entropy of '
+                f"the width by itself; got {width_entropy} with {projection!r}."
+            )
         reason = ": weights are relative to those of the other actions"
         number = check_count("num_action_samples", num_action_samples, least=2, reason=reason)
+        if is_paired and number % 2:
+            raise ValueError(
+                'num_action_samples must be even with projection="gradient", whose actions come '
+                f"in pairs, got {number}."
+            )
         options |= {"num_action_samples": number}
         super().__init__(actor_network, qvalue_network, value_network, **options)
-        self.projection = projection
+        self.projection, self.width_entropy = projection, width_entropy
+
+    def lift(
+        self,
+        observations: TensorDictBase,
+        reference: Distribution,
+        qvalue_params: TensorDictParams | None = None,
+        num_samples: int | None = None,
+    ) -> Lift:
+        """The base's; with ``projection="gradient"``, where the policy learns, by pairs and slopes.
+
+        The arguments are those of :meth:`ActorCriticLoss.lift`; the policy learns where the number
+        of samples is left to the loss.
+        """
+        if self.projection != "gradient" or num_samples is not None:
+            return super().lift(observations, reference, qvalue_params, num_samples)
+        params = (self.qvalue_network_params if qvalue_params is None else qvalue_params).data
+        _, tau_prime = self.temperatures()
+
+        def height(latent: Tensor) -> tuple[Tensor, Tensor]:
+            actions = PairedActions.at(latent, reference)
+            score = self.score_of(observations, actions, params)
+            if not score.requires_grad:
+                raise ValueError(NO_SLOPE)
+            return (score + tau_prime * actions.log_volume).sum(), score
+
+        with torch.no_grad():
+            actions = PairedActions.of(reference, self.num_action_samples)
+            if torch.compiler.is_compiling():  # a graph has no place for autograd, which is faster
+                slope, score = torch.func.grad(height, has_aux=True)(actions.latent)
+            else:
+                with torch.enable_grad():
+                    latent = actions.latent.requires_grad_()
+                    total, score = height(latent)
+                    (slope,) = torch.autograd.grad(total, latent)
+                latent.requires_grad_(False)
+            return self.lifted(actions, score.detach(), slope)
 
     def project(self, states: States) -> Surrogate:
-        """Eq. 11 with the lift's weights, in nats; centred or to the letter."""
-        actions, log_weights = states.lift.actions, states.lift.log_weights
+        """Eq. 11 with the lift's weights, in nats; centred, to the letter, or by the moments."""
+        lift, actions, log_weights = states.lift, states.lift.actions, states.lift.log_weights
         if self.projection == "paper":
             log_prob = actions.log_prob_of(states.policy)
             return mean_seeking_projection(log_prob, log_weights, sample_dim=0)
         loc, scale = gaussian_parameters(states.policy)
         assert isinstance(actions, SampledActions)
-        return centred_gaussian_projection(loc, scale, actions.latent, log_weights, sample_dim=0)
+        if lift.slope is None:
+            return centred_gaussian_projection(
+                loc, scale, actions.latent, log_weights, sample_dim=0
+            )
+        tau, tau_prime = self.temperatures()
+        old_loc, old_scale = (x.detach() for x in gaussian_parameters(states.reference))
+        shift, width = lifted_gaussian_moments(
+            (actions.latent - old_loc) / old_scale,
+            old_scale * lift.slope,
+            log_weights,
+            tau=tau,
+            tau_prime=tau_prime,
+            width_entropy=self.width_entropy,
+            sample_dim=0,
+            mask=states.mask,
+        )
+        mean, variance = old_loc + old_scale * shift, old_scale.square() * width
+        loss = gaussian_cross_entropy(loc, scale, mean, variance)
+        divergence = 0.5 * (shift.square() + width - 1 - width.log()).sum(-1)
+        return Surrogate(loss, lift.weights, metrics={"kl_target_reference": divergence})
 
 
 class DiscreteECACLoss(ECACLoss):
