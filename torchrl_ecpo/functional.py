@@ -466,7 +466,7 @@ def centred_gaussian_projection(
 
 
 def gaussian_cross_entropy(loc: Tensor, scale: Tensor, mean: Tensor, variance: Tensor) -> Tensor:
-    r"""Project by the mean-seeking KL(target, pi) onto a diagonal Gaussian, by the target's moments.
+    r"""Project by the mean-seeking KL(target, pi) onto a diagonal Gaussian, by given moments.
 
     .. math::
         \frac{\partial L}{\partial \mu} = \frac{\mu - m}{\sigma^2}, \qquad
@@ -490,6 +490,7 @@ def gaussian_cross_entropy(loc: Tensor, scale: Tensor, mean: Tensor, variance: T
         >>> loc.grad, scale.grad
         (tensor([-2.]), tensor([-2.]))
     """
+    _check_samples(loc=loc, scale=scale, mean=mean, variance=variance)
     log_scale = scale.log()
     distance = (mean - loc) / scale.detach()
     width = variance * (-2 * log_scale).exp()
@@ -505,7 +506,7 @@ def lifted_gaussian_moments(
     tau_prime: float | Tensor,
     width_entropy: float = 1.0,
     sample_dim: int = -1,
-    mask: Tensor | None = None,
+    state_mask: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     r"""Mean and variance of the lifted Gaussian policy (Eq. 8), from samples and gradients of Q.
 
@@ -542,7 +543,7 @@ def lifted_gaussian_moments(
         width_entropy: phi in S. With 1 (default) S is the target's variance. Below, it is that of
             a target with less entropy, whose mean stays where it is.
         sample_dim: the axis of the M samples, in ``log_weights``.
-        mask: ``[E*]``, True where a state is real: others have no part in c.
+        state_mask: ``[E*]``, True where a state is real: others have no part in c.
 
     Returns:
         The mean :math:`\delta` and the variance S, ``[E*, A]`` each, in units of the reference's
@@ -572,6 +573,18 @@ def lifted_gaussian_moments(
                 f"{name} must have the shape {tuple(each)} of log_weights and an axis of A more, "
                 f"the same as samples, got {tuple(value.shape)}."
             )
+    one = log_weights.select(dim, 0).shape
+    if state_mask is not None and (
+        not isinstance(state_mask, Tensor)
+        or state_mask.dtype != torch.bool
+        or state_mask.shape != one
+    ):
+        raise ValueError(
+            f"state_mask must be boolean, of the shape {tuple(one)} of log_weights without the "
+            f"samples, got {_kind(state_mask)} of shape {tuple(getattr(state_mask, 'shape', ()))}."
+        )
+    if not (_is_number(width_entropy) and 0 <= width_entropy <= 1):
+        raise ValueError(f"width_entropy must be in [0, 1], got {width_entropy!r}.")
     if each[dim] % 2:
         raise ValueError(f"samples must come in pairs, got {each[dim]} of them.")
     tau, tau_prime = (torch.as_tensor(t).to(samples) for t in (tau, tau_prime))
@@ -587,7 +600,7 @@ def lifted_gaussian_moments(
     first, second = weights.chunk(2, dim)
     freedom = 1 - (first - second).square().sum(dim)
     is_known = freedom > torch.finfo(freedom.dtype).eps ** 0.5
-    is_pooled = is_known if mask is None else is_known & mask.unsqueeze(-1)
+    is_pooled = is_known if state_mask is None else is_known & state_mask.unsqueeze(-1)
 
     def covariance(a: Tensor, b: Tensor) -> Tensor:
         return mean((a - mean(a)) * (b - mean(b))).squeeze(dim) / freedom.where(is_known, 1.0)

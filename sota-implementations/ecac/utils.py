@@ -32,7 +32,8 @@ from torchrl.envs import (
     set_exploration_type,
 )
 from torchrl.modules import AdditiveGaussianModule
-from torchrl.objectives import DDPGLoss, LossModule, SACLoss, TargetNetUpdater, TD3Loss
+from torchrl.objectives import DDPGLoss, LossModule, TargetNetUpdater, TD3Loss
+from width_sac import WidthSACLoss
 
 from torchrl_ecpo import (
     ECACLoss,
@@ -59,7 +60,7 @@ LOSSES = {
     "ecac": ECACLoss,
     "pmd_ac": PMDACLoss,
     "mpo": MPOLoss,
-    "sac": SACLoss,
+    "sac": WidthSACLoss,
     "sac_score": ScoreSACLoss,
     "td3": TD3Loss,
     "ddpg": DDPGLoss,

@@ -1023,7 +1023,11 @@ def test_learned_temperatures_settle_where_the_constraints_hold(case):
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
-        ("ecac", {"projection": "bogus"}, r"projection must be one of \('centred', 'paper'\), got"),
+        (
+            "ecac",
+            {"projection": "bogus"},
+            r"projection must be one of \('centred', 'paper', 'gradient'\), got",
+        ),
         ("ecac", {"num_actor_states": 0}, "num_actor_states must be an integer of at least 1"),
         ("ecac", {"num_action_samples": 1}, "num_action_samples.*least 2: weights are relative.*1"),
         ("ecac", {"use_prioritized_weights": "yes"}, "use_prioritized_weights must be.*got 'yes'"),

@@ -227,7 +227,7 @@ class ECACLoss(ActorCriticLoss):
             tau_prime=tau_prime,
             width_entropy=self.width_entropy,
             sample_dim=0,
-            mask=states.mask,
+            state_mask=states.mask,
         )
         mean, variance = old_loc + old_scale * shift, old_scale.square() * width
         loss = gaussian_cross_entropy(loc, scale, mean, variance)
