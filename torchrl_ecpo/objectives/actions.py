@@ -157,9 +157,9 @@ class PairedActions(SampledActions):
     @classmethod
     def of(cls, distribution: Distribution, num_samples: int) -> SampledActions:
         """Draw half of them, and mirror these about the mean; M must be even."""
-        loc, scale = gaussian_parameters(distribution)
-        noise = torch.randn(num_samples // 2, *loc.shape, dtype=loc.dtype, device=loc.device)
-        return cls.at(loc + scale * torch.cat([noise, -noise]), distribution)
+        loc, _ = gaussian_parameters(distribution)
+        half = split(distribution)[0].rsample(torch.Size([num_samples // 2]))
+        return cls.at(torch.cat([half, 2 * loc - half]), distribution)
 
     def divergence_bound(self, target_kl: float) -> float:
         """In nats, from that per action dimension; gradients show more than M samples can."""

@@ -46,9 +46,10 @@ class ECACLoss(ActorCriticLoss):
 
     Args:
         actor_network: a policy with ``get_dist``: a Gaussian or tanh-Gaussian one for
-            ``projection="centred"``, any with ``rsample`` for ``"paper"``. Actions are ``[*B, A]``.
-        qvalue_network: reads observation and action, writes ``"state_action_value"`` ``[*B, 1]``.
-            A list gives the networks one by one.
+            ``projection="centred"`` and ``"gradient"``, any with ``rsample`` for ``"paper"``.
+            Actions are ``[*B, A]``.
+        qvalue_network: reads observation and action, writes ``"state_action_value"`` ``[*B, 1]``;
+            differentiable in the action for ``"gradient"``. A list gives the networks one by one.
         value_network: reads the observation, writes ``"state_value"`` ``[*B, 1]``. With it, the
             value of the next state is that of its delayed copy (the paper, Eq. 9); without
             (default), it is computed from delayed Q and the reference policy (Eq. 8), which learned
@@ -59,8 +60,9 @@ class ECACLoss(ActorCriticLoss):
             learned, where it starts. Default: 0.3.
         tau_prime: temperature of the entropy, likewise. Default: 1, as SAC's alpha.
         target_kl: KL(target, pi_bar) per action dimension, in nats, that tau is learned to hold
-            (``loss_tau``, parameter ``log_tau``). It must be below log M / A. None: tau is
-            fixed, or scheduled by assignment. Default: 0.083, half a nat for six dimensions.
+            (``loss_tau``, parameter ``log_tau``). It must be below log M / A, but with
+            ``"gradient"``. None: tau is fixed, or scheduled by assignment. Default: 0.083, half a
+            nat for six dimensions.
         target_entropy: entropy in nats that tau_prime is learned to hold (``loss_tau_prime``,
             parameter ``log_tau_prime``), as SAC's alpha is; ``"auto"`` (default, SAC's) is -A.
             None: tau_prime is fixed, or scheduled by assignment. It must be below the log-volume of
@@ -70,11 +72,17 @@ class ECACLoss(ActorCriticLoss):
             the policy lags behind its target. Default: 0.003.
         projection: ``"centred"`` (default): the scale is fitted to the variance about the samples'
             own mean, :func:`~torchrl_ecpo.functional.centred_gaussian_projection`. ``"paper"``:
-            Eq. 11 to the letter.
+            Eq. 11 to the letter. ``"gradient"``: mean and variance of the same target, from
+            antithetic pairs of samples and the gradient of Q there,
+            :func:`~torchrl_ecpo.functional.lifted_gaussian_moments`; its coefficient is that of the
+            whole batch, so that the states of a batch are not independent.
+        width_entropy: phi, from 0 to 1, with ``"gradient"`` only: what part of the entropy term
+            widens the policy; it moves the mean as before. Default: 1, the paper's target.
         num_qvalue_nets: the least of so many soft Q values counts. Default: 2 (the paper's).
         num_actor_states: the policy, the value network and the temperatures learn from the first so
             many entries of the batch only, which saves time where M is large. Default: None, all.
-        num_action_samples: M, at least 2. Default: 8.
+        num_action_samples: M, at least 2, and even with ``"gradient"``, for which 4 are enough.
+            Default: 8.
         num_next_action_samples: actions at the next state, from which its value is computed where
             there is no value network. Default: 1 (the paper's estimate).
         loss_function: ``"l2"`` (default; Eq. 9 and 10 without their factor 1/2), ``"l1"`` or
@@ -99,7 +107,8 @@ class ECACLoss(ActorCriticLoss):
     The outputs are ``loss_actor``, ``loss_qvalue``, ``loss_value`` (with a value network),
     ``loss_tau`` and ``loss_tau_prime`` (where learned), each reaching its own parameters only, so
     that their sum can be backpropagated at once; and, detached, ``ESS`` of the weights,
-    ``kl_target_reference`` = KL(target, pi_bar), ``kl_reference_policy`` = KL(pi_bar, pi_theta),
+    ``kl_target_reference`` = KL(target, pi_bar), by samples or, with ``"gradient"``, of Gaussians
+    of these moments, ``kl_reference_policy`` = KL(pi_bar, pi_theta),
     ``entropy`` of the reference, ``saturation`` (share of action components in the outer 5 % of
     their range), ``qvalue``, ``state_value``, ``tau`` and ``tau_prime``. The
     temporal difference error is written into the input as ``"td_error"``, 0 where the entry
@@ -109,7 +118,9 @@ class ECACLoss(ActorCriticLoss):
     Raises:
         ValueError: for discrete or hybrid actions, a Q network that reads no action, a value
             network without delay, no samples, temperatures that are not allowed, an unknown or
-            ill-typed option; when called, for a target_kl that M samples cannot show or a
+            ill-typed option, an odd number of actions in pairs, a width_entropy without
+            ``"gradient"``; when called, for a policy that is no Gaussian or a Q network without
+            a gradient where one is needed, a target_kl that M samples cannot show or a
             target_entropy that no policy has, an entry of another shape or type or without a
             transition, actions that are none, weights below 0, and NaN or infinite values.
         TypeError: if ``actor_network`` has no ``get_dist``.

@@ -43,7 +43,7 @@ class MPOLoss(ActorCriticLoss):
     scale are those of ``ECACLoss(projection="paper")``; the farther it is, the more the bounds say.
 
     Arguments, errors and outputs are those of :class:`~torchrl_ecpo.ECACLoss` without
-    ``projection`` and ``target_kl``, and with these differences. A state is worth the delayed
+    ``projection``, ``width_entropy`` and ``target_kl``, and with these differences. A state is worth the delayed
     policy's mean of Q: there is no entropy in Q. Of a tanh-Gaussian policy mean, scale and
     divergences are those before the transform.
 
