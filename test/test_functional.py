@@ -1477,6 +1477,20 @@ def test_lifted_gaussian_moments_by_hand(dtype):
     assert_close(variance, vector(1, 0.01, dtype=dtype).unsqueeze(-1))  # 0 would be no variance
 
 
+@pytest.mark.parametrize(
+    ("curvature", "control"),
+    [(1.0, 1.0), (-0.5, 2.0), (-3.0, 0.0)],  # (tau + tau') / (tau + curvature), from 0 to 2
+)
+def test_control_coefficient_is_bounded(curvature, control):
+    """Where the score curves upward: tau = tau' = 1 and z = (1 + curvature) x / 2, at +-1."""
+    samples, log_weights = vector(1, -1).unsqueeze(-1), vector(3, 1).log()
+    lifts = Lifts(samples, -curvature * samples, log_weights, *(torch.empty(0),) * 2)
+    shift, variance = lifts.moments(tau=1.0, tau_prime=1.0)
+    share = (1 + curvature) / 2
+    assert_close(shift, vector(0.5 - control * share / 2))
+    assert_close(variance, vector(1 - control * (share - 1)))
+
+
 @pytest.mark.parametrize("size", [1, 6, 17])
 @pytest.mark.parametrize("curvature", [0.0, 1.5])
 @pytest.mark.parametrize(("tau", "tau_prime"), [(0.5, 0.25), (1.0, 0.0), (0.0, 0.4), (0.3, 5.0)])

@@ -556,10 +556,10 @@ def lifted_gaussian_moments(
         ValueError: for shapes that do not go together and an odd number of samples.
 
     Examples:
-        f = 2x, tau = 1, tau' = 0: the target is N(2, 1).
+        f = 2x, tau = 1, tau' = 0: the target is N(2, 1), whatever the weights are.
 
         >>> samples = torch.tensor([[0.5], [-0.5]])
-        >>> slope, log_weights = torch.full((2, 1), 2.0), torch.tensor([1.0, -1.0])
+        >>> slope, log_weights = torch.full((2, 1), 2.0), torch.zeros(2)
         >>> lifted_gaussian_moments(samples, slope, log_weights, tau=1.0, tau_prime=0.0)
         (tensor([2.]), tensor([1.]))
     """
