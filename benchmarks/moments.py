@@ -55,9 +55,8 @@ def measure(estimator: str, m: int, size: int) -> dict[str, Any]:
         score = (gradient * x - curved * x / 2).sum(-1)
         log_weights = (score + TAU_PRIME * x.square().sum(-1) / 2) / (TAU + TAU_PRIME)
         if estimator == "gradient":
-            temperatures = {"tau": TAU, "tau_prime": TAU_PRIME}
             moments = lifted_gaussian_moments(
-                x, gradient - curved, log_weights, **temperatures, sample_dim=0
+                x, gradient - curved, log_weights, tau=TAU, tau_prime=TAU_PRIME, sample_dim=0
             )
         else:
             moments = of_samples(x, log_weights)
