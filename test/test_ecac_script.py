@@ -16,6 +16,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from processes import run_script
 from tensordict import TensorDict
+from torchrl.objectives import SACLoss
 
 from torchrl_ecpo.experiment import read_metrics
 from torchrl_ecpo.modules import DenseNetwork
@@ -132,8 +133,14 @@ def test_evaluation_does_not_disturb_training(sweep, tmp_path):
 @pytest.mark.parametrize(
     "options",
     [
-        ("env=hopper", "replay_buffer.storage=memmap"),
-        ("env=dm_control", "env.name=pendulum", "env.task=swingup", "loss=sac"),
+        (
+            *("env=hopper", "replay_buffer.storage=memmap"),
+            *("loss.options.projection=gradient", "loss.options.width_entropy=0.4"),
+        ),
+        (
+            *("env=dm_control", "env.name=pendulum", "env.task=swingup"),
+            *("loss=sac", "loss.options.width_entropy=0.4"),
+        ),
         pytest.param(("collector=multi_sync", "loss=sac"), marks=pytest.mark.slow),
         (
             *("loss.reference_interval=5", "loss.options.projection=paper"),
@@ -423,12 +430,40 @@ def test_the_score_function_gradient_is_the_reparameterised_one_in_expectation(u
     batch = TensorDict({"observation": torch.randn(1, 3).expand(200_000, 3)}, [200_000])
     options = {"num_qvalue_nets": 1, "loss_function": "l2"}
     parameters = list(networks[0].parameters())
-    losses = [make(*networks, **options) for make in (utils.SACLoss, utils.ScoreSACLoss)]
+    losses = [make(*networks, **options) for make in (SACLoss, utils.ScoreSACLoss)]
     losses[1].qvalue_network_params.data.copy_(losses[0].qvalue_network_params.data)
     gradients = [
         torch.autograd.grad(loss_module.actor_loss(batch)[0], parameters) for loss_module in losses
     ]
     torch.testing.assert_close(*gradients, rtol=0.02, atol=0.01)
+
+
+def test_width_sac_changes_the_policy_s_width_alone(utils):
+    """With phi = 1 nothing; with less, alpha (1 - phi) log sigma is added."""
+    torch.manual_seed(0)
+    spec = utils.GymEnv("Pendulum-v1").action_spec
+    actor = utils.make_tanh_gaussian_actor(3, spec, hidden_sizes=[4])
+    qvalue = utils.make_qvalue_network(3, 1, hidden_sizes=[4])
+    batch = TensorDict({"observation": torch.randn(50, 3)}, [50])
+    options = {"loss_function": "l2", "alpha_init": 0.5}
+    losses = [
+        SACLoss(actor, qvalue, **options),
+        utils.WidthSACLoss(actor, qvalue, **options),
+        utils.WidthSACLoss(actor, qvalue, **options, width_entropy=0.4),
+    ]
+    values = []
+    for loss_module in losses:
+        loss_module.qvalue_network_params.data.copy_(losses[0].qvalue_network_params.data)
+        torch.manual_seed(1)
+        values.append(loss_module.actor_loss(batch)[0])
+    log_scale = actor[0](batch.clone())["scale"].log().sum(-1).mean()
+    values.append(values[0] + 0.5 * (1 - 0.4) * log_scale)
+    same, narrower, expected = (
+        torch.autograd.grad(value - values[0], list(actor.parameters()), retain_graph=True)
+        for value in values[1:]
+    )
+    torch.testing.assert_close(narrower, expected)
+    assert not any(gradient.any() for gradient in same)
 
 
 @pytest.mark.slow  # some three minutes

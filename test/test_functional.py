@@ -23,9 +23,11 @@ from torchrl_ecpo.functional import (
     clipped_gain,
     divergence_penalty,
     effective_sample_size,
+    gaussian_cross_entropy,
     group_cross_entropy,
     leave_one_out,
     lift_divergence_estimate,
+    lifted_gaussian_moments,
     lifted_log_weights,
     masked_mean,
     matched_temperature,
@@ -1413,3 +1415,159 @@ def test_path_consistency_holds_at_the_optimum_on_every_path(tau, tau_prime, gam
         options = {"tau": tau, "tau_prime": tau_prime, "gamma": gamma, "n_steps": n_steps}
         assert_close(path_consistency(*paths, **options), torch.zeros(16, 4).double())
         assert (path_consistency(paths[0] + 0.01, *paths[1:], **options) > 0.0099).all()
+
+
+# ---------------------------------------------------------------- moments by the score's gradient
+
+
+def test_gaussian_cross_entropy_by_hand():
+    """At N(2, 4), of moments 5 and 12: log 2 + (12/4 + 9/4 + log 2 pi) / 2."""
+    loc, log_scale = vector(2).requires_grad_(), vector(math.log(2)).requires_grad_()
+    loss = gaussian_cross_entropy(loc, log_scale.exp(), vector(5), vector(12))
+    assert_close(loss.item(), math.log(2) + 0.5 * (3 + 2.25 + math.log(2 * math.pi)))
+    loss.backward()
+    assert_close((loc.grad, log_scale.grad), (vector(-3 / 4), vector(1 - 12 / 4)))
+
+
+class Lifts(NamedTuple):
+    """Samples of a standard Gaussian in pairs ``[M, B, A]``, and f = g x - x H x / 2 there."""
+
+    samples: Tensor
+    slope: Tensor
+    log_weights: Tensor
+    mean: Tensor
+    variance: Tensor
+
+    @classmethod
+    def of(cls, gradient: Tensor, hessian: Tensor, m: int, *, tau: float, tau_prime: float):
+        """With the target's moments: its precision is (tau + H) / (tau + tau')."""
+        half = torch.randn(m // 2, *gradient.shape, dtype=gradient.dtype)
+        x = torch.cat([half, -half])
+        curved = torch.einsum("bij,mbj->mbi", hessian, x)
+        total = tau + tau_prime
+        score = (gradient * x - curved * x / 2).sum(-1) + tau_prime * x.square().sum(-1) / 2
+        covariance = torch.linalg.inv(tau * torch.eye(x.shape[-1], dtype=x.dtype) + hessian)
+        mean = torch.einsum("bij,bj->bi", covariance, gradient)
+        variance = total * covariance.diagonal(dim1=-2, dim2=-1)
+        return cls(x, gradient - curved, score / total, mean, variance)
+
+    def moments(self, **options):
+        """As they are estimated."""
+        return lifted_gaussian_moments(*self[:3], sample_dim=0, **options)
+
+
+@DTYPES
+def test_lifted_gaussian_moments_by_hand(dtype):
+    """Curvatures 1 and 3, tau = tau' = 1: z = x and 2x, so that c = (1 + 2) / (1 + 4) = 3/5.
+
+    With weights 3/4 and 1/4 at +-1 the mean is 1/2, and all covariances are those of equal ones.
+    """
+    samples = vector(1, -1, dtype=dtype).view(2, 1, 1).expand(2, 2, 1)
+    slope = -samples * vector(1, 3, dtype=dtype).view(1, 2, 1)
+    log_weights = vector(3, 1, dtype=dtype).log().unsqueeze(-1).expand(2, 2)
+    lifts = Lifts(samples, slope, log_weights, *(torch.empty(0),) * 2)
+    temperatures = {"tau": 1.0, "tau_prime": 1.0}
+    shift, variance = lifts.moments(**temperatures)
+    assert_close(shift, vector(0.5 - 0.6 * 0.5, 0.5 - 0.6 * 1, dtype=dtype).unsqueeze(-1))
+    assert_close(variance, vector(1 - 0.6 * (1 - 1), 1 - 0.6 * (2 - 1), dtype=dtype).unsqueeze(-1))
+    variance = lifts.moments(**temperatures, width_entropy=0.0)[1]
+    assert_close(variance, vector(1 - 0.6 * 0.5, 1 - 0.6 * 1.5, dtype=dtype).unsqueeze(-1))
+    shift, variance = lifts.moments(**temperatures, state_mask=torch.tensor([True, False]))
+    assert_close(shift, vector(0, -0.5, dtype=dtype).unsqueeze(-1))  # c = 1
+    assert_close(variance, vector(1, 0.01, dtype=dtype).unsqueeze(-1))  # 0 would be no variance
+
+
+@pytest.mark.parametrize(
+    ("curvature", "control"),
+    [(1.0, 1.0), (-0.5, 2.0), (-3.0, 0.0)],  # (tau + tau') / (tau + curvature), from 0 to 2
+)
+def test_control_coefficient_is_bounded(curvature, control):
+    """Where the score curves upward: tau = tau' = 1 and z = (1 + curvature) x / 2, at +-1."""
+    samples, log_weights = vector(1, -1).unsqueeze(-1), vector(3, 1).log()
+    lifts = Lifts(samples, -curvature * samples, log_weights, *(torch.empty(0),) * 2)
+    shift, variance = lifts.moments(tau=1.0, tau_prime=1.0)
+    share = (1 + curvature) / 2
+    assert_close(shift, vector(0.5 - control * share / 2))
+    assert_close(variance, vector(1 - control * (share - 1)))
+
+
+@pytest.mark.parametrize("size", [1, 6, 17])
+@pytest.mark.parametrize("curvature", [0.0, 1.5])
+@pytest.mark.parametrize(("tau", "tau_prime"), [(0.5, 0.25), (1.0, 0.0), (0.0, 0.4), (0.3, 5.0)])
+def test_moments_are_exact_where_the_curvature_is_the_same(size, curvature, tau, tau_prime):
+    """Of one pair at each state already, whatever the weights; phi narrows the width alone."""
+    if tau == curvature == 0:
+        return  # no distribution
+    torch.manual_seed(size)
+    gradient = torch.randn(5, size, dtype=torch.float64) / 3
+    hessian = curvature * torch.linspace(1, 2, size).double().diag().expand(5, -1, -1)
+    lifts = Lifts.of(gradient, hessian, 2, tau=tau, tau_prime=tau_prime)
+    shift, variance = lifts.moments(tau=tau, tau_prime=tau_prime)
+    assert_close((shift, variance), (lifts.mean, lifts.variance))
+    lifts = lifts._replace(log_weights=torch.zeros(2, 5).double())
+    shift, variance = lifts.moments(tau=tau, tau_prime=tau_prime, width_entropy=0.4)
+    share = (tau + 0.4 * tau_prime) / (tau + tau_prime)
+    assert_close((shift, variance), (lifts.mean, (share * lifts.variance).clamp_min(0.01)))
+
+
+@pytest.mark.parametrize("size", [6, 17])
+def test_moments_converge_and_err_less_than_those_of_samples(size):
+    """A full Hessian at each state. Four samples with gradients against eight without."""
+    torch.manual_seed(0)
+    root = torch.randn(500, size, size, dtype=torch.float64) / size**0.5
+    gradient = torch.randn(500, size, dtype=torch.float64) * 0.4 / size**0.5
+    temperatures = {"tau": 1.0, "tau_prime": 0.25}
+
+    def errors(m):
+        lifts = Lifts.of(gradient, root @ root.mT / 4, m, **temperatures)
+        weights = lifts.log_weights.softmax(0).unsqueeze(-1)
+        by_weights = (weights * lifts.samples).sum(0) - lifts.mean
+        shift, variance = lifts.moments(**temperatures)
+        differences = (by_weights, shift - lifts.mean, variance - lifts.variance)
+        return torch.stack([x.square().mean().sqrt() for x in differences])
+
+    few, eight, many = errors(4), errors(8), errors(2_000)
+    assert few[1] < eight[0] / 2
+    assert (many[1:] < 0.03).all()
+    assert (many[1:] < few[1:] / 5).all()
+
+
+def test_moments_of_a_curved_score_by_quadrature():
+    """f = sin 2x: of one dimension, where the target can be summed on a grid."""
+    torch.manual_seed(0)
+    tau, tau_prime = 0.7, 0.3
+    grid = torch.linspace(-9, 9, 20_001, dtype=torch.float64)
+    density = (-tau * grid.square() / 2 + (2 * grid).sin()).softmax(0)
+    mean = (density * grid).sum()
+    variance = (density * (grid - mean).square()).sum()
+    half = torch.randn(50_000, 4, 1, dtype=torch.float64)
+    x = torch.cat([half, -half])
+    log_weights = ((2 * x).sin() + tau_prime * x.square() / 2).squeeze(-1)
+    lifts = Lifts(x, 2 * (2 * x).cos(), log_weights, mean, variance)
+    estimate = lifts.moments(tau=tau, tau_prime=tau_prime)
+    assert_close(estimate, (mean.expand(4, 1), variance.expand(4, 1)), atol=0.02, rtol=0)
+
+
+def test_antithetic_pairs_have_their_own_degrees_of_freedom():
+    """Without them, by 1 - sum w^2 = 3/4 of four flat weights, S would be 4/3 of what it is."""
+    torch.manual_seed(0)
+    flat = torch.zeros(20_000, 1, dtype=torch.float64)
+    lifts = Lifts.of(flat, flat.unsqueeze(-1), 4, tau=1.0, tau_prime=0.0)
+    curved = torch.randn_like(lifts.slope) * 1e3  # which leaves c = 0
+    variance = lifts._replace(slope=curved).moments(tau=1.0, tau_prime=0.0)[1]
+    assert variance.mean().item() == pytest.approx(1, abs=0.03)
+
+
+def test_moments_of_one_sample_and_of_any_shape():
+    """All weight on one sample tells no width; states are pooled over all their dimensions."""
+    torch.manual_seed(0)
+    gradient = torch.randn(6, 2, dtype=torch.float64)
+    lifts = Lifts.of(gradient, torch.eye(2).double().expand(6, 2, 2), 4, tau=1.0, tau_prime=0.5)
+    alone = lifts._replace(
+        log_weights=torch.full((4, 6), -1e5).double().index_fill(0, vector(1).long(), 0.0)
+    )
+    assert_close(alone.moments(tau=1.0, tau_prime=0.5)[1], torch.ones(6, 2).double())
+    expected = lifts.moments(tau=1.0, tau_prime=0.5)
+    moved = [x.unflatten(1, (3, 2)).movedim(0, 2) for x in lifts[:3]]
+    actual = lifted_gaussian_moments(*moved, tau=1.0, tau_prime=0.5)
+    assert_close([x.flatten(0, 1) for x in actual], list(expected))

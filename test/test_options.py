@@ -75,7 +75,7 @@ def split(options):
         ("ecac gamma=2", "gamma must be a number >= 0 and <= 1, got 2."),
         ("ecac polyak=0", "polyak must be a number > 0 and <= 1, got 0."),
         ("ecac replay_buffer.storage=tape", "must be tensor or memmap, got 'tape'."),
-        ("ecac loss.options.projection=mean", "must be centred or paper, got 'mean'."),
+        ("ecac loss.options.projection=mean", "must be centred or paper or gradient, got 'mean'."),
         ("logger.backend=excel", "must be csv or tensorboard or wandb, got 'excel'."),
     ],
 )

@@ -33,7 +33,8 @@ from torchrl.envs import (
     set_exploration_type,
 )
 from torchrl.modules import AdditiveGaussianModule
-from torchrl.objectives import DDPGLoss, LossModule, SACLoss, TargetNetUpdater, TD3Loss
+from torchrl.objectives import DDPGLoss, LossModule, TargetNetUpdater, TD3Loss
+from width_sac import WidthSACLoss
 
 from torchrl_ecpo import (
     DiscreteECACLoss,
@@ -66,7 +67,7 @@ LOSSES = {
     "pmd_ac": PMDACLoss,
     "discrete_pmd_ac": DiscretePMDACLoss,
     "mpo": MPOLoss,
-    "sac": SACLoss,
+    "sac": WidthSACLoss,
     "sac_score": ScoreSACLoss,
     "td3": TD3Loss,
     "ddpg": DDPGLoss,

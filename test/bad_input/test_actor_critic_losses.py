@@ -22,6 +22,7 @@ OPTIONS = {
     "delay_qvalue": True,
     "target_entropy": None,
     "target_kl": None,
+    "width_entropy": 1.0,
     "epsilon": 0.2,
     "epsilon_mean": 0.01,
     "epsilon_scale": 0.001,

@@ -39,6 +39,11 @@ GOOD = {
     "loc": numbers(3, 2),
     "scale": numbers(3, 2).exp(),
     "samples": numbers(3, 4, 2),
+    "slope": numbers(3, 4, 2),
+    "mean": numbers(3, 2),
+    "variance": numbers(3, 2).exp(),
+    "width_entropy": 0.4,
+    "state_mask": torch.tensor([True, False, True]),
     "horizon": 10.0,
     "num_trajectories": 7,
     "allow_zero": False,
@@ -49,6 +54,7 @@ GOOD = {
 OPTIONAL = (
     *("mask", "sample_dim", "keepdim", "control_log_prob", "behaviour_log_prob", "allow_zero"),
     *("base_weights", "normaliser", "gamma", "n_steps"),
+    *("state_mask", "width_entropy"),
 )
 NAMES = [name for name in functional.__all__ if name not in ("Surrogate", "check_temperatures")]
 

@@ -1023,7 +1023,11 @@ def test_learned_temperatures_settle_where_the_constraints_hold(case):
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
-        ("ecac", {"projection": "bogus"}, r"projection must be one of \('centred', 'paper'\), got"),
+        (
+            "ecac",
+            {"projection": "bogus"},
+            r"projection must be one of \('centred', 'paper', 'gradient'\), got",
+        ),
         ("ecac", {"num_actor_states": 0}, "num_actor_states must be an integer of at least 1"),
         ("ecac", {"num_action_samples": 1}, "num_action_samples.*least 2: weights are relative.*1"),
         ("ecac", {"use_prioritized_weights": "yes"}, "use_prioritized_weights must be.*got 'yes'"),
@@ -1327,10 +1331,20 @@ def _assert_compiled_is_eager(loss, batch, backend):
             torch._dynamo.config.error_on_recompile = True
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        pytest.param(
+            {"projection": "gradient", "width_entropy": 0.4}, id="gradient", marks=pytest.mark.slow
+        ),
+    ],
+)
 @compiler_warnings
-def test_compile():
+def test_compile(options):
     """The whole of one loss, with the package's networks; what the others add is slow to ask."""
-    _assert_compiled_is_eager(_dense(num_actor_states=4, target_kl=0.05), _batch(), "eager")
+    loss = _dense(num_actor_states=4, target_kl=0.05, **options)
+    _assert_compiled_is_eager(loss, _batch(), "eager")
 
 
 @pytest.mark.slow

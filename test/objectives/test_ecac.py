@@ -26,8 +26,12 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal, V
 from trajectory_problems import OBSERVATION
 
 from torchrl_ecpo import DiscreteECACLoss, ECACLoss, PeriodicCopy
-from torchrl_ecpo.functional import centred_gaussian_projection, mean_seeking_projection
-from torchrl_ecpo.objectives.actions import gaussian_parameters
+from torchrl_ecpo.functional import (
+    centred_gaussian_projection,
+    lifted_gaussian_moments,
+    mean_seeking_projection,
+)
+from torchrl_ecpo.objectives.actions import PairedActions, gaussian_parameters
 
 CASE, DISCRETE = CASES["ecac"], CASES["discrete_ecac"]
 TEMPERATURES = pytest.mark.parametrize(
@@ -256,6 +260,135 @@ def test_policy_that_is_no_gaussian():
     assert all(output.isfinite() for output in outputs.values())
     grads = gradients(loss, outputs["loss_actor"])
     assert any(g.abs().max() > 0 for name, g in grads.items() if "actor" in name)
+
+
+# ------------------------------------------------------------------------- by the gradient of Q
+
+PAIRED = {"projection": "gradient", "num_action_samples": 4}
+
+
+@pytest.mark.parametrize("delay", [False, True])
+@pytest.mark.parametrize("width_entropy", [1.0, 0.4])
+@pytest.mark.parametrize("name", ["linear", "quadratic"])
+def test_moments_by_the_gradient_are_those_of_the_target(name, width_entropy, delay):
+    """Exact for two actions; the gradients are at the policy, the moments of the reference."""
+    tau, tau_prime = 0.5, 0.25
+    loss = gaussian_bandit(
+        quadratic(name),
+        tau=tau,
+        tau_prime=tau_prime,
+        delay_actor=delay,
+        width_entropy=width_entropy,
+        **PAIRED | {"num_action_samples": 2},
+    )
+    loc, scale = loss.actor_network.parameters()
+    if delay:
+        PeriodicCopy(loss, "actor_network", interval=1_000)
+        loc.data += 0.3
+        scale.data *= 1.5
+    surrogate = loss.project(loss.states(states(3)))
+    target, _ = _target(name, tau, tau_prime)
+    variance = target.variance * (tau + width_entropy * tau_prime) / (tau + tau_prime)
+    expected = ((loc - target.mean) / scale**2, 1 / scale - variance / scale**3)
+    assert_close(torch.autograd.grad(surrogate.loss.sum() / 3, (loc, scale)), expected)
+    divergence = kl_divergence(Normal(target.mean, variance.sqrt()), Normal(LOC, SCALE)).sum()
+    assert_close(surrogate.metrics["kl_target_reference"], divergence.expand(3))
+
+
+@pytest.mark.parametrize("kind", ["normal", "tanh_normal", "bounded"])
+def test_slope_is_that_of_the_least_score_and_the_volume(kind):
+    """By finite differences of Q(a(u)) + tau' log|da/du|; and its actions come in pairs."""
+    loss = CASE.build(make_networks(kind), **PAIRED)
+    at = loss.states(make_batch(kind))
+    lift, (loc, _) = at.lift, gaussian_parameters(at.reference)
+    first, second = lift.actions.latent.chunk(2)
+    assert_close(first + second, 2 * loc.expand(2, -1, -1))
+    assert not any(x.requires_grad for x in (lift.slope, lift.score, *lift.actions[:3]))
+
+    def height(latent):
+        actions = PairedActions.at(latent, at.reference)
+        score = loss.score_of(at.observations, actions, loss.qvalue_network_params)
+        return score + loss.tau_prime * actions.log_volume
+
+    for i, step in enumerate(1e-5 * torch.eye(ACTION).double()):
+        difference = height(lift.actions.latent + step) - height(lift.actions.latent - step)
+        assert_close(lift.slope[..., i], difference / 2e-5, atol=1e-7, rtol=1e-5)
+
+
+def test_only_real_states_are_pooled():
+    """As if the others were not there; also among the first states of a batch."""
+    mask = torch.tensor([True, False, True, True, False, True])
+    batch = make_batch().set(("collector", "mask"), mask)
+    loss = CASE.build(**PAIRED, reduction="none")
+    at = loss.states(batch, mask)
+    loss_actor, lift = loss.project(at).loss, at.lift
+    loc, scale = (x[mask].detach() for x in gaussian_parameters(at.reference))
+    shift, width = lifted_gaussian_moments(
+        (lift.actions.latent[:, mask] - loc) / scale,
+        lift.slope[:, mask] * scale,
+        lift.log_weights[:, mask],
+        tau=loss.tau,
+        tau_prime=loss.tau_prime,
+        sample_dim=0,
+    )
+    expected = (scale.log() + 0.5 * (width + shift**2 + math.log(2 * math.pi))).sum(-1)
+    assert_close(loss_actor[mask], expected)
+    assert_close(call(loss, batch)["loss_actor"][~mask], torch.zeros(2).double())
+    assert call(CASE.build(**PAIRED, num_actor_states=4), batch)["loss_actor"].isfinite()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("options", [{"tau": 0.0}, {"delay_actor": True}, {"value": True}], ids=str)
+def test_gradient_projection_reaches_the_policy_alone(dtype, options):
+    """Also without gradients around it, at tau = 0 and with a delayed policy."""
+    loss = CASE.build(make_networks(dtype=dtype), **PAIRED, **options)
+    batch = make_batch(dtype=dtype)
+    outputs = call(loss, batch)
+    assert all(value.isfinite().all() for value in outputs.values())
+    reached = {n for n, g in gradients(loss, outputs["loss_actor"]).items() if g.abs().max() > 0}
+    assert {name.split(".")[0] for name in reached} == {"actor_network_params"}
+    with torch.no_grad():
+        assert_close(call(loss, batch), outputs)
+
+
+def test_tau_is_learned_by_the_divergence_of_the_gaussians():
+    """Gradients show more than the log M of samples: 2 * 0.8 nats are allowed."""
+    outputs = call(CASE.build(**PAIRED, target_kl=0.8), make_batch())
+    excess = (outputs["kl_target_reference"] / 1.6 - 1).clamp(-1, 1)
+    assert_close(outputs["loss_tau"].detach(), -math.log(CASE.tau) * excess)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"num_action_samples": 5}, r'must be even with projection="gradient".*pairs, got 5'),
+        ({"width_entropy": 1.5}, r"width_entropy must be in \[0, 1\], got 1.5"),
+        ({"width_entropy": "a"}, "width_entropy must be a number, got 'a'"),
+        (
+            {"projection": "paper", "width_entropy": 0.4},
+            "width_entropy is an option of projection=\"gradient\".*got 0.4 with 'paper'",
+        ),
+    ],
+    ids=str,
+)
+def test_options_of_the_gradient(options, message):
+    with pytest.raises(ValueError, match=message):
+        CASE.build(**PAIRED | options)
+
+
+def test_what_has_no_gradient():
+    """A policy that is no Gaussian, and a critic that is not differentiable in the action."""
+    networks = make_networks()
+    networks.actor = ProbabilisticActor(
+        networks.actor[0],  # type: ignore
+        in_keys=["loc", "scale"],
+        distribution_class=lambda loc, scale: Independent(Beta(loc.exp(), scale), 1),
+    )
+    with pytest.raises(ValueError, match=r"needs a diagonal Gaussian.*got Independent"):
+        call(CASE.build(networks, **PAIRED), make_batch())
+    loss = gaussian_bandit(torch.Tensor.detach, distribution=TanhNormal, **PAIRED)
+    with pytest.raises(ValueError, match=r"qvalue_network that is differentiable in the action"):
+        loss.project(loss.states(states(3)))
 
 
 def test_saturation_is_of_the_range_of_the_actions():

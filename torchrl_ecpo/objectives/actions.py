@@ -30,6 +30,7 @@ from torchrl_ecpo.modules.latents import split
 __all__ = [
     "Actions",
     "AllActions",
+    "PairedActions",
     "SampledActions",
     "actions_of",
     "gaussian_parameters",
@@ -91,8 +92,13 @@ class SampledActions(NamedTuple):
         Log-probabilities are those of the latent that was drawn: a saturated tanh is never
         inverted.
         """
+        base, _ = split(distribution)
+        return cls.at(base.rsample(torch.Size([num_samples])), distribution)
+
+    @classmethod
+    def at(cls, latent: Tensor, distribution: Distribution) -> SampledActions:
+        """Those that come of latents ``[M, *B, A]``."""
         base, transforms = split(distribution)
-        latent = base.rsample(torch.Size([num_samples]))
         action, log_volume = latent, 0.0
         for transform in transforms:
             before, action = action, transform(action)
@@ -143,6 +149,21 @@ class SampledActions(NamedTuple):
                 "num_action_samples."
             )
         return bound
+
+
+class PairedActions(SampledActions):
+    """M actions of a Gaussian policy in antithetic pairs, valued together with their gradient."""
+
+    @classmethod
+    def of(cls, distribution: Distribution, num_samples: int) -> SampledActions:
+        """Draw half of them, and mirror these about the mean; M must be even."""
+        loc, _ = gaussian_parameters(distribution)
+        half = split(distribution)[0].rsample(torch.Size([num_samples // 2]))
+        return cls.at(torch.cat([half, 2 * loc - half]), distribution)
+
+    def divergence_bound(self, target_kl: float) -> float:
+        """In nats, from that per action dimension; gradients show more than M samples can."""
+        return self.action.shape[-1] * target_kl
 
 
 class AllActions(NamedTuple):

@@ -72,6 +72,8 @@ class Lift(NamedTuple):
     """``[M, *B]``, :attr:`log_weights` normalised."""
     value: Tensor
     """``[*B]``, the value of the state."""
+    slope: Tensor | None = None
+    """``[M, *B, A]``, gradient by the latents of the score, and of tau' times the log-volume."""
 
 
 @dataclass(eq=False)
@@ -85,6 +87,8 @@ class States:
     reference: Distribution
     """The policy that is lifted, a delayed copy or the policy itself."""
     make_lift: Callable[[TensorDictBase, Distribution], Lift]
+    mask: Tensor | None = None
+    """``[*B]``, True where a state is real; None: all are."""
     made: Lift | None = None
 
     @property
@@ -275,7 +279,8 @@ class ActorCriticLoss(PolicyLoss):
         """How far the policy is from its target at each state ``[*B]``, up to a constant (Eq. 11).
 
         The weights are those of the lift, ``[M, *B]``. Further losses and metrics, ``[*B]`` or
-        0-d, have the names that :attr:`losses` and :attr:`metrics` declare.
+        0-d, have the names that :attr:`losses` and :attr:`metrics` declare. A metric
+        ``kl_target_reference`` stands for the estimate from the weights, and tau is learned by it.
         """
 
     # The rewards tell the batch size: entries of a single number each would be taken for a batch.
@@ -315,9 +320,10 @@ class ActorCriticLoss(PolicyLoss):
         qvalue = self._chosen_qvalue(transitions, mask)
         td_error = (qvalue.detach() - target).abs().amax(0)
         errors = distance_loss(qvalue, target.expand_as(qvalue), self.loss_function)  # Eq. 10
-        states = self.states(transitions)
+        states = self.states(transitions, mask)
         surrogate = self.project(states)
-        self._check_declared(surrogate.losses, surrogate.metrics)
+        own = {name: x for name, x in surrogate.metrics.items() if name != "kl_target_reference"}
+        self._check_declared(surrogate.losses, own)
         lift = states.lift
         of_all = Reduction(self.reduction, target.shape, mask, weights)
         of_states = of_all.first(self.num_actor_states)
@@ -370,19 +376,22 @@ class ActorCriticLoss(PolicyLoss):
         params = self.qvalue_network_params if qvalue_params is None else qvalue_params
         with torch.no_grad():
             actions = actions_of(reference, number)
-            score = self.score_of(observations, actions, params)
-            if actions.log_prob.shape != score.shape:
-                raise ValueError(
-                    f"The soft Q values of the actions have the shape {tuple(score.shape)}, their "
-                    f"log-probabilities {tuple(actions.log_prob.shape)}: actor and Q network must "
-                    "know the same actions, and an action of several numbers has one "
-                    "log-probability, as with torch.distributions.Independent or TanhNormal."
-                )
-            log_weights, value = actions.lift(score, *self.temperatures())
-            weights = self_normalised_weights(log_weights, sample_dim=0)
-            if not self.has_soft_value:
-                value = actions.mean(score)
-        return Lift(actions, score, log_weights, weights, value)
+            return self.lifted(actions, self.score_of(observations, actions, params))
+
+    def lifted(self, actions: Actions, score: Tensor, slope: Tensor | None = None) -> Lift:
+        """The lift, of actions that have been valued."""
+        if actions.log_prob.shape != score.shape:
+            raise ValueError(
+                f"The soft Q values of the actions have the shape {tuple(score.shape)}, their "
+                f"log-probabilities {tuple(actions.log_prob.shape)}: actor and Q network must "
+                "know the same actions, and an action of several numbers has one "
+                "log-probability, as with torch.distributions.Independent or TanhNormal."
+            )
+        log_weights, value = actions.lift(score, *self.temperatures())
+        weights = self_normalised_weights(log_weights, sample_dim=0)
+        if not self.has_soft_value:
+            value = actions.mean(score)
+        return Lift(actions, score, log_weights, weights, value, slope)
 
     def score_of(
         self, observations: TensorDictBase, actions: Actions, qvalue_params: TensorDictParams
@@ -400,8 +409,11 @@ class ActorCriticLoss(PolicyLoss):
         inputs.set(self.tensor_keys.action, actions.action.reshape(*rows, actions.action.shape[-1]))
         return self._qvalues(inputs, qvalue_params).amin(0).reshape(shape)
 
-    def states(self, transitions: Any) -> States:
-        """Where the policy learns, the policy, and the reference: its delayed copy, or itself."""
+    def states(self, transitions: Any, mask: Tensor | None = None) -> States:
+        """Where the policy learns, the policy, and the reference: its delayed copy, or itself.
+
+        The mask ``[*B]`` is True where a transition is real; None: all are.
+        """
         if self.num_actor_states is not None:
             if not transitions.ndim:
                 raise ValueError(
@@ -410,11 +422,12 @@ class ActorCriticLoss(PolicyLoss):
                     "num_actor_states=None."
                 )
             transitions = transitions[: self.num_actor_states]
+            mask = None if mask is None else mask[: self.num_actor_states]
         policy = reference = self._distribution(transitions, self.actor_network_params)
         if self.delay_actor:
             with torch.no_grad():
                 reference = self._distribution(transitions, self.target_actor_network_params)
-        return States(transitions, policy, reference, self.lift)
+        return States(transitions, policy, reference, self.lift, mask)
 
     def _distribution(self, tensordict: TensorDictBase, params: TensorDictParams) -> Distribution:
         inputs = tensordict.select(*self.actor_network.in_keys)

@@ -4,20 +4,30 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+import torch
+from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from torch import Tensor
+from torch.distributions import Distribution
 
-from torchrl_ecpo.checks import check_choice, check_count
+from torchrl_ecpo.checks import as_fraction, check_choice, check_count
 from torchrl_ecpo.functional import (
     Surrogate,
     centred_gaussian_projection,
+    gaussian_cross_entropy,
+    lifted_gaussian_moments,
     mean_seeking_projection,
 )
-from torchrl_ecpo.objectives.actions import SampledActions, gaussian_parameters
-from torchrl_ecpo.objectives.actor_critic import ActorCriticLoss, States
+from torchrl_ecpo.objectives.actions import PairedActions, SampledActions, gaussian_parameters
+from torchrl_ecpo.objectives.actor_critic import ActorCriticLoss, Lift, States
 
 __all__ = ["DiscreteECACLoss", "ECACLoss"]
 
-PROJECTIONS = ("centred", "paper")
+PROJECTIONS = ("centred", "paper", "gradient")
+NO_SLOPE = (
+    'projection="gradient" needs a qvalue_network that is differentiable in the action, but no '
+    'gradient comes back through this one: mend it, or take projection="centred".'
+)
 
 
 class ECACLoss(ActorCriticLoss):
@@ -36,9 +46,10 @@ class ECACLoss(ActorCriticLoss):
 
     Args:
         actor_network: a policy with ``get_dist``: a Gaussian or tanh-Gaussian one for
-            ``projection="centred"``, any with ``rsample`` for ``"paper"``. Actions are ``[*B, A]``.
-        qvalue_network: reads observation and action, writes ``"state_action_value"`` ``[*B, 1]``.
-            A list gives the networks one by one.
+            ``projection="centred"`` and ``"gradient"``, any with ``rsample`` for ``"paper"``.
+            Actions are ``[*B, A]``.
+        qvalue_network: reads observation and action, writes ``"state_action_value"`` ``[*B, 1]``;
+            differentiable in the action for ``"gradient"``. A list gives the networks one by one.
         value_network: reads the observation, writes ``"state_value"`` ``[*B, 1]``. With it, the
             value of the next state is that of its delayed copy (the paper, Eq. 9); without
             (default), it is computed from delayed Q and the reference policy (Eq. 8), which learned
@@ -49,8 +60,9 @@ class ECACLoss(ActorCriticLoss):
             learned, where it starts. Default: 0.3.
         tau_prime: temperature of the entropy, likewise. Default: 1, as SAC's alpha.
         target_kl: KL(target, pi_bar) per action dimension, in nats, that tau is learned to hold
-            (``loss_tau``, parameter ``log_tau``). It must be below log M / A. None: tau is
-            fixed, or scheduled by assignment. Default: 0.083, half a nat for six dimensions.
+            (``loss_tau``, parameter ``log_tau``). It must be below log M / A, but with
+            ``"gradient"``. None: tau is fixed, or scheduled by assignment. Default: 0.083, half a
+            nat for six dimensions.
         target_entropy: entropy in nats that tau_prime is learned to hold (``loss_tau_prime``,
             parameter ``log_tau_prime``), as SAC's alpha is; ``"auto"`` (default, SAC's) is -A.
             None: tau_prime is fixed, or scheduled by assignment. It must be below the log-volume of
@@ -60,11 +72,17 @@ class ECACLoss(ActorCriticLoss):
             the policy lags behind its target. Default: 0.003.
         projection: ``"centred"`` (default): the scale is fitted to the variance about the samples'
             own mean, :func:`~torchrl_ecpo.functional.centred_gaussian_projection`. ``"paper"``:
-            Eq. 11 to the letter.
+            Eq. 11 to the letter. ``"gradient"``: mean and variance of the same target, from
+            antithetic pairs of samples and the gradient of Q there,
+            :func:`~torchrl_ecpo.functional.lifted_gaussian_moments`; its coefficient is that of the
+            whole batch, so that the states of a batch are not independent.
+        width_entropy: phi, from 0 to 1, with ``"gradient"`` only: what part of the entropy term
+            widens the policy; it moves the mean as before. Default: 1, the paper's target.
         num_qvalue_nets: the least of so many soft Q values counts. Default: 2 (the paper's).
         num_actor_states: the policy, the value network and the temperatures learn from the first so
             many entries of the batch only, which saves time where M is large. Default: None, all.
-        num_action_samples: M, at least 2. Default: 8.
+        num_action_samples: M, at least 2, and even with ``"gradient"``, for which 4 are enough.
+            Default: 8.
         num_next_action_samples: actions at the next state, from which its value is computed where
             there is no value network. Default: 1 (the paper's estimate).
         loss_function: ``"l2"`` (default; Eq. 9 and 10 without their factor 1/2), ``"l1"`` or
@@ -89,7 +107,8 @@ class ECACLoss(ActorCriticLoss):
     The outputs are ``loss_actor``, ``loss_qvalue``, ``loss_value`` (with a value network),
     ``loss_tau`` and ``loss_tau_prime`` (where learned), each reaching its own parameters only, so
     that their sum can be backpropagated at once; and, detached, ``ESS`` of the weights,
-    ``kl_target_reference`` = KL(target, pi_bar), ``kl_reference_policy`` = KL(pi_bar, pi_theta),
+    ``kl_target_reference`` = KL(target, pi_bar), by samples or, with ``"gradient"``, of Gaussians
+    of these moments, ``kl_reference_policy`` = KL(pi_bar, pi_theta),
     ``entropy`` of the reference, ``saturation`` (share of action components in the outer 5 % of
     their range), ``qvalue``, ``state_value``, ``tau`` and ``tau_prime``. The
     temporal difference error is written into the input as ``"td_error"``, 0 where the entry
@@ -99,7 +118,9 @@ class ECACLoss(ActorCriticLoss):
     Raises:
         ValueError: for discrete or hybrid actions, a Q network that reads no action, a value
             network without delay, no samples, temperatures that are not allowed, an unknown or
-            ill-typed option; when called, for a target_kl that M samples cannot show or a
+            ill-typed option, an odd number of actions in pairs, a width_entropy without
+            ``"gradient"``; when called, for a policy that is no Gaussian or a Q network without
+            a gradient where one is needed, a target_kl that M samples cannot show or a
             target_entropy that no policy has, an entry of another shape or type or without a
             transition, actions that are none, weights below 0, and NaN or infinite values.
         TypeError: if ``actor_network`` has no ``get_dist``.
@@ -135,26 +156,94 @@ class ECACLoss(ActorCriticLoss):
         qvalue_network: TensorDictModule | list[TensorDictModule],
         value_network: TensorDictModule | None = None,
         *,
-        projection: Literal["centred", "paper"] = "centred",
+        projection: Literal["centred", "paper", "gradient"] = "centred",
+        width_entropy: float = 1.0,
         num_action_samples: int = 8,
         **options: Any,
     ) -> None:
         check_choice("projection", projection, PROJECTIONS)
+        is_paired = projection == "gradient"
+        width_entropy = as_fraction("width_entropy", width_entropy)
+        if width_entropy != 1 and not is_paired:
+            raise ValueError(
+                'width_entropy is an option of projection="gradient", which has the entropy of '
+                f"the width by itself; got {width_entropy} with {projection!r}."
+            )
         reason = ": weights are relative to those of the other actions"
         number = check_count("num_action_samples", num_action_samples, least=2, reason=reason)
+        if is_paired and number % 2:
+            raise ValueError(
+                'num_action_samples must be even with projection="gradient", whose actions come '
+                f"in pairs, got {number}."
+            )
         options |= {"num_action_samples": number}
         super().__init__(actor_network, qvalue_network, value_network, **options)
-        self.projection = projection
+        self.projection, self.width_entropy = projection, width_entropy
+
+    def lift(
+        self,
+        observations: TensorDictBase,
+        reference: Distribution,
+        qvalue_params: TensorDictParams | None = None,
+        num_samples: int | None = None,
+    ) -> Lift:
+        """The base's; with ``projection="gradient"``, where the policy learns, by pairs and slopes.
+
+        The arguments are those of :meth:`ActorCriticLoss.lift`; the policy learns where the number
+        of samples is left to the loss.
+        """
+        if self.projection != "gradient" or num_samples is not None:
+            return super().lift(observations, reference, qvalue_params, num_samples)
+        params = (self.qvalue_network_params if qvalue_params is None else qvalue_params).data
+        _, tau_prime = self.temperatures()
+
+        def height(latent: Tensor) -> tuple[Tensor, Tensor]:
+            actions = PairedActions.at(latent, reference)
+            score = self.score_of(observations, actions, params)
+            if not score.requires_grad:
+                raise ValueError(NO_SLOPE)
+            return (score + tau_prime * actions.log_volume).sum(), score
+
+        with torch.no_grad():
+            actions = PairedActions.of(reference, self.num_action_samples)
+            if torch.compiler.is_compiling():  # a graph has no place for autograd, which is faster
+                slope, score = torch.func.grad(height, has_aux=True)(actions.latent)
+            else:
+                with torch.enable_grad():
+                    latent = actions.latent.requires_grad_()
+                    total, score = height(latent)
+                    (slope,) = torch.autograd.grad(total, latent)
+                latent.requires_grad_(False)
+            return self.lifted(actions, score.detach(), slope)
 
     def project(self, states: States) -> Surrogate:
-        """Eq. 11 with the lift's weights, in nats; centred or to the letter."""
-        actions, log_weights = states.lift.actions, states.lift.log_weights
+        """Eq. 11 with the lift's weights, in nats; centred, to the letter, or by the moments."""
+        lift, actions, log_weights = states.lift, states.lift.actions, states.lift.log_weights
         if self.projection == "paper":
             log_prob = actions.log_prob_of(states.policy)
             return mean_seeking_projection(log_prob, log_weights, sample_dim=0)
         loc, scale = gaussian_parameters(states.policy)
         assert isinstance(actions, SampledActions)
-        return centred_gaussian_projection(loc, scale, actions.latent, log_weights, sample_dim=0)
+        if lift.slope is None:
+            return centred_gaussian_projection(
+                loc, scale, actions.latent, log_weights, sample_dim=0
+            )
+        tau, tau_prime = self.temperatures()
+        old_loc, old_scale = (x.detach() for x in gaussian_parameters(states.reference))
+        shift, width = lifted_gaussian_moments(
+            (actions.latent - old_loc) / old_scale,
+            old_scale * lift.slope,
+            log_weights,
+            tau=tau,
+            tau_prime=tau_prime,
+            width_entropy=self.width_entropy,
+            sample_dim=0,
+            state_mask=states.mask,
+        )
+        mean, variance = old_loc + old_scale * shift, old_scale.square() * width
+        loss = gaussian_cross_entropy(loc, scale, mean, variance)
+        divergence = 0.5 * (shift.square() + width - 1 - width.log()).sum(-1)
+        return Surrogate(loss, lift.weights, metrics={"kl_target_reference": divergence})
 
 
 class DiscreteECACLoss(ECACLoss):

@@ -43,9 +43,9 @@ class MPOLoss(ActorCriticLoss):
     scale are those of ``ECACLoss(projection="paper")``; the farther it is, the more the bounds say.
 
     Arguments, errors and outputs are those of :class:`~torchrl_ecpo.ECACLoss` without
-    ``projection`` and ``target_kl``, and with these differences. A state is worth the delayed
-    policy's mean of Q: there is no entropy in Q. Of a tanh-Gaussian policy mean, scale and
-    divergences are those before the transform.
+    ``projection``, ``width_entropy`` and ``target_kl``, and with these differences. A state is
+    worth the delayed policy's mean of Q: there is no entropy in Q. Of a tanh-Gaussian policy mean,
+    scale and divergences are those before the transform.
 
     Keyword Args:
         epsilon: bound of KL(target, pi_bar) in nats, below log M. Default: 0.1 (Acme's).

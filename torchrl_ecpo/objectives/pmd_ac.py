@@ -29,7 +29,7 @@ class PMDACLoss(ActorCriticLoss):
     Over one of n actions it is (tau + tau') KL(pi, target) itself, summed over all of them.
 
     Arguments, errors and outputs are those of :class:`~torchrl_ecpo.ECACLoss` without
-    ``projection``, and with these differences:
+    ``projection`` and ``width_entropy``, and with these differences:
 
     Keyword Args:
         tau: temperature of the divergence from the reference, in the unit of Q. It has an effect
