@@ -26,7 +26,7 @@ html_title = project
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = (
-    4  # links like results.md#the-search-behind-the-first-study, as GitHub has them
+    4  # links like searches.md#the-search-behind-the-first-study, as GitHub has them
 )
 
 autodoc_default_options = {"members": True, "member-order": "bysource", "show-inheritance": True}

@@ -1,7 +1,26 @@
 from __future__ import annotations
 
+import importlib
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
 
 # pytest's importlib mode does not make a test's neighbours importable.
 sys.path.insert(0, str(Path(__file__).parent))
+
+STUDY = Path(__file__).parents[1] / "sota-implementations/study"
+
+
+@pytest.fixture(scope="module")
+def study():
+    """The modules of the study, which are scripts beside each other."""
+    names = [path.stem for path in sorted(STUDY.glob("*.py"))]
+    sys.path.insert(0, str(STUDY))
+    try:
+        yield SimpleNamespace(**{name: importlib.import_module(name) for name in names})
+    finally:
+        sys.path.remove(str(STUDY))
+        for name in names:
+            sys.modules.pop(name, None)

@@ -21,6 +21,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
+from processes import run_script
 from tensordict import NonTensorData, TensorDict
 from torchrl.checkpoint import Checkpoint, CheckpointError
 from torchrl.envs import DMControlEnv, GymEnv, TransformedEnv
@@ -50,10 +51,9 @@ RUNS = {
     "bandit": BANDIT,
     "copy": ("ecpo", "env=copy", "total_trajectories=192", "project_steps=2", *ALGORITHMIC),
     "cartpole": (
-        *("ecpo", "env=gym", "total_trajectories=192", "env.max_steps=20"),
-        *("num_groups=2", "group_size=8", "evaluation_interval=1"),
+        *("ecpo", "env=gym", "total_trajectories=96", "env.max_steps=20"),
+        *("num_groups=2", "group_size=8", "evaluation_interval=2"),
     ),
-    "pendulum": (*CONTROL, "env=pendulum", ECAC_STATES),
     "hopper": (
         *(*CONTROL, "env=hopper", ECAC_STATES),
         *("loss.reference_interval=5", "replay_buffer.size=100"),
@@ -205,7 +205,6 @@ def change_record(directory):
     ("spoil", "options", "message"),
     [
         (flip_a_bit, (), "checkpoint-0*20 is damaged: .*loss_module/state.pt has changed"),
-        (flip_a_bit, ("resume=auto",), "checkpoint-0*20 is damaged: .*loss_module/state.pt has"),
         (remove_checkpoints, (), "nothing to resume from, for .*checkpoints holds no checkpoint"),
         (make_foreign, (), "checkpoint-0*20 is no checkpoint of a run of this script"),
         (cut_record, (), "metrics.csv does not reach to step 20"),
@@ -291,7 +290,6 @@ def change_manifest(path):
     manifest.write_text(manifest.read_text().replace('"step": 10', '"step": 11'))
 
 
-@pytest.mark.parametrize("resume", ["auto", "directory"])
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
@@ -307,7 +305,7 @@ def change_manifest(path):
         (put_folder_for_file, "net/state.pt is missing, .*net/state does not belong to it"),
     ],
 )
-def test_a_damaged_checkpoint_is_refused_and_left_as_it_is(tmp_path, resume, damage, message):
+def test_a_damaged_checkpoint_is_refused_and_left_as_it_is(tmp_path, damage, message):
     net = torch.nn.Linear(2, 2)
     written = attach(tmp_path, net=net)
     save(written, 5)
@@ -316,8 +314,9 @@ def test_a_damaged_checkpoint_is_refused_and_left_as_it_is(tmp_path, resume, dam
     save(written, 10)
     damage(written.latest)
     before = contents(tmp_path)
-    with pytest.raises(CheckpointError, match=rf"checkpoint-0*10 is damaged: .*{message}"):
-        attach(tmp_path, "auto" if resume == "auto" else str(tmp_path), net=net)
+    for resume in ("auto", str(tmp_path)):
+        with pytest.raises(CheckpointError, match=rf"checkpoint-0*10 is damaged: .*{message}"):
+            attach(tmp_path, resume, net=net)
     assert contents(tmp_path) == before
     assert not (tmp_path / "evil").exists()
     # The message says what helps: the one before it.
@@ -452,7 +451,7 @@ def test_a_finished_run_can_be_prolonged(tmp_path, start):
 
 
 def test_a_finished_run_stays_as_it_is(tmp_path, start, capfd):
-    run = (*RUNS["pendulum"], "total_frames=120")
+    run = (*CONTROL, "env=pendulum", ECAC_STATES, "total_frames=120")
     start(tmp_path, *run)
     rows, (path,) = record(tmp_path), checkpoints(tmp_path)
     assert "replay_buffer" not in Checkpoint.manifest(path)["components"]
@@ -591,9 +590,7 @@ def test_ctrl_c_and_resume_auto_as_a_user_types_them(tmp_path):
     options = " ".join(command[2:])
     expected = f"Stopped by SIGINT. Resume with: python {command[1]} {options} resume={directory}"
     assert expected in output
-    other = subprocess.run(
-        [*command[:-1], "total_trajectories=60", "resume=auto"],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    options = (*command[2:-1], "total_trajectories=60", "resume=auto")
+    other = run_script(tmp_path, SCRIPTS / "ecpo/ecpo.py", *options)
     assert "total_trajectories was 2000000, is 60" in other.stderr
     assert list(tmp_path.glob("runs/*/*/*/*")) == [directory]

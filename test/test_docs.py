@@ -5,11 +5,10 @@ from __future__ import annotations
 import csv
 import re
 import shlex
-import subprocess
-import sys
 from functools import lru_cache
 from itertools import product, zip_longest
 from pathlib import Path
+from statistics import median
 from textwrap import dedent
 
 import pytest
@@ -17,6 +16,7 @@ import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
+from processes import run_script
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -76,6 +76,17 @@ def python_blocks(page: Path) -> list[str]:
     return [dedent(block) for _, language, block in blocks if language == "python"]
 
 
+def sentences(page: Path) -> list[list[str]]:
+    """The words of each sentence outside code, tables, headings and pictures; a formula is one."""
+    text = re.sub(r"<!--.*?-->|\$\$.*?\$\$", "", FENCED.sub("", page.read_text()), flags=re.DOTALL)
+    text = re.sub(r"^ *(?:[|#!%]|\[!).*$", "", text, flags=re.MULTILINE)
+    text = re.sub(r"\]\([^)]*\)", "]", re.sub(r"`[^`]+`|\$[^$]+\$", "X", text))
+    paragraphs = re.split(r"\n\s*\n|\n(?= *(?:- |\d+\. ))", text.replace("Eq. ", "Eq."))
+    parts = (part for text in paragraphs for part in re.split(r"(?<=[.?!])[*)_]*\s+", text))
+    words = ([word for word in part.split() if re.search(r"\w", word)] for part in parts)
+    return [sentence for sentence in words if sentence]
+
+
 def links(page: Path) -> list[str]:
     return [link for link in LINK.findall(prose(page)) if "://" not in link]
 
@@ -99,7 +110,10 @@ def composed(config_directory: Path, overrides: tuple[str, ...]) -> DictConfig:
 
 
 def compose_command(script: Path, options: str) -> None:
-    """Compose the runs that a command line starts: of a sweep, every value of every option once."""
+    """Compose the runs that a command line starts: of a sweep, every value of every option once.
+
+    Of seeds one, for they compose alike.
+    """
     words = shlex.split(options, comments=True)
     overrides = [word for word in words if not word.startswith("-")]
     parsed = OverridesParser.create().parse_overrides(overrides)
@@ -109,6 +123,7 @@ def compose_command(script: Path, options: str) -> None:
         else [str(override.input_line)]
         for override in parsed
     ]
+    choices = [values[:1] if values[0].startswith("seed=") else values for values in choices]
     for run in list(zip_longest(*choices)) or [()]:
         overrides = (value or values[0] for value, values in zip(run, choices, strict=True))
         config = composed(script.parent / "config", tuple(overrides))
@@ -125,7 +140,8 @@ def test_examples_run(page, tmp_path, monkeypatch):
     for script, options in commands(page):
         directory = re.search(r"hydra\.run\.dir=(\S+)", options)
         if directory and any(directory[1] in block for block in blocks):  # which read this run
-            subprocess.run([sys.executable, script, *shlex.split(options)], check=True)
+            process = run_script(tmp_path, script, *shlex.split(options))
+            assert process.returncode == 0, process.stderr
     namespace: dict[str, object] = {"__name__": "__main__"}
     for number, block in enumerate(blocks, start=1):
         exec(compile(block, f"{name(page)}, python block {number}", "exec"), namespace)
@@ -211,6 +227,22 @@ def test_the_page_of_equations_names_tests_that_exist():
         files = [(DOCS / link).read_text() for link in LINK.findall(row) if "/test_" in link]
         defined = {found for file in files for found in re.findall(r"^def (test_\w+)", file, re.M)}
         assert set(re.findall(r"`(test_\w+)`", row)) <= defined, row
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/results.md", "docs/searches.md"])
+def test_sentences_are_short_and_results_are_read_in_one_go(page):
+    text = sentences(ROOT / page)
+    assert median(map(len, text)) <= 16
+    assert [" ".join(words) for words in text if len(words) > 25] == []
+    assert len((ROOT / page).read_text().splitlines()) <= 450
+
+
+def test_sentences_are_counted_by_hand(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(
+        "# A heading\n\n- **One, two.** See [three four](x.md) in `a b`.\n- $5 + 5$ is Eq. 6\n"
+    )
+    assert [len(words) for words in sentences(page)] == [2, 5, 3]
 
 
 def test_a_wrong_option_is_noticed():

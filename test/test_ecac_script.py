@@ -133,18 +133,16 @@ def test_evaluation_does_not_disturb_training(sweep, tmp_path):
     "options",
     [
         ("env=hopper", "replay_buffer.storage=memmap"),
-        ("env=dm_control", "loss=td3"),
         ("env=dm_control", "env.name=pendulum", "env.task=swingup", "loss=sac"),
-        ("collector=multi_sync", "loss=sac"),
-        ("loss.reference_interval=5", "loss.options.projection=paper"),
-        ("loss.value_network=true", "+loss.lr.value_network=3e-4"),
+        pytest.param(("collector=multi_sync", "loss=sac"), marks=pytest.mark.slow),
         (
-            "loss.options.target_kl=null",
-            "~loss.lr.log_tau",
+            *("loss.reference_interval=5", "loss.options.projection=paper"),
+            *("loss.value_network=true", "+loss.lr.value_network=3e-4"),
+            *("loss.options.target_kl=null", "~loss.lr.log_tau"),
             "loss.options.tau={schedule:linear,start:0.2,end:0.1,duration:160}",
         ),
     ],
-    ids=lambda options: " ".join(options),
+    ids=" ".join,
 )
 def test_tasks_collectors_and_ablations_run(tmp_path, options):
     if "env=hopper" in options or "env=dm_control" in options:

@@ -172,7 +172,9 @@ def test_a_state_is_loaded_before_the_first_row(tmp_path):
 
 
 @pytest.fixture
-def runs(tmp_path):
+def runs(tmp_path, monkeypatch):
+    """Without the pictures that runs leave."""
+    monkeypatch.setattr("torchrl_ecpo.experiment.run.plot_learning_curve", lambda *_, **__: "")
     curves = {"ecpo": [(1.0, 3.0, 5.0), (1.0, 5.0, 7.0)], "urex": [(0.0, 1.0, 2.0)]}
     for method, values in curves.items():
         for seed, returns in enumerate(values):

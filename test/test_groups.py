@@ -139,8 +139,6 @@ class TestPack:
         ("change", "error", "match"),
         [
             (lambda s: s.exclude("group"), KeyError, "'group'.*'next', 'done'.*GroupedEnv"),
-            (lambda s: s.set("group", s["group"].float()), ValueError, "integers, got torch.float"),
-            (lambda s: s.set("group", torch.ones(12, 2)), ValueError, r"\(12,\).*\(12, 2\)"),
             (lambda s: s[3:], ValueError, r"Group 5 has 1 trajectories, expected 2 \(1 of 3"),
             (lambda s: s[:-1], ValueError, "Group 9 has 1 trajectories"),
             (lambda s: s[:9], ValueError, "1 trajectories have no end.*group 2.*StepCounter"),
@@ -161,8 +159,6 @@ class TestPack:
 
     def test_bad_sizes(self):
         steps = make_steps(TRAJECTORIES)
-        with pytest.raises(ValueError, match=r"group_size must be an integer of at least 2.*got 1"):
-            pack_groups(steps, group_size=1)
         with pytest.raises(ValueError, match=r"at least 2.*got 1"):
             pack_groups(make_steps([(0, 2), (1, 2)]))
         with pytest.raises(ValueError, match="Groups of 2 trajectories, expected group_size=3"):
@@ -175,8 +171,6 @@ class TestPack:
         [
             (MASK, (0, 0, 0), False, "holes"),
             (MASK, (0, 0), False, "1 trajectories have no real step"),
-            (MASK, None, torch.ones(3, 2, 4), "boolean.*got torch.float32"),
-            (MASK, None, torch.ones(3, 2, 4, 2) > 0, r"must have the shape \(.*4\)"),
             ("group", (0, 1), 4, re.escape("groups [4, 5]")),
             ("group", (0, 0, 1), 4, "1 trajectories change their group"),
             (DONE, (1, 0), False, r"1 trajectories have no end .*'done'"),
@@ -187,10 +181,7 @@ class TestPack:
     )
     def test_bad_padding(self, key, where, value, match):
         groups = pack_groups(make_steps(TRAJECTORIES, is_init=True)).clone()
-        if where is None:
-            groups[key] = value
-        else:
-            groups[key][where] = value
+        groups[key][where] = value
         for data in (groups,) if "groups" in match else (groups, groups.reshape(6, 4)):
             with pytest.raises(ValueError, match=match):
                 pack_groups(data)
@@ -300,7 +291,7 @@ class TestSampler:
         """Whatever the lengths, fragments and sizes; nothing whole is left out, either."""
         draw = random.Random(0)
         drawn = 0
-        for _ in range(40):
+        for _ in range(20):
             lengths = [draw.randint(1, 5) for _ in range(30)]
             size = draw.randint(5, 9)
             steps = make_steps([(7, n) for n in lengths], traj_ids=traj_ids, is_init=is_init)
@@ -317,7 +308,7 @@ class TestSampler:
                 if buffer.can_sample():
                     assert is_whole(buffer.sample())
                     drawn += 1
-        assert drawn > 100
+        assert drawn > 50
 
     @pytest.mark.parametrize("parts", [(2, 4), (6,), (3, 3), (1, 2, 3), (5, 1)])
     def test_what_just_fits_the_storage_is_drawn(self, parts):
@@ -498,7 +489,6 @@ class TestSampler:
         ("options", "error", "match"),
         [
             ({"group_size": 1}, ValueError, "group_size must be an integer of at least 2.*got 1"),
-            ({"num_groups": 0}, ValueError, "num_groups must be an integer of at least 1"),
             ({"batch_size": 5}, ValueError, r"num_groups \* group_size=2, got 5"),
             ({"num_groups": 3}, ValueError, r"num_groups=3 \* group_size=2, got 4"),
             ({"group_key": "instance"}, KeyError, "'instance' is missing.*problem instance"),

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import math
 import pickle
 
 import pytest
@@ -129,24 +128,10 @@ def test_schedule_from_a_configuration(setting, at_five):
     ("make", "message"),
     [
         (lambda: linear(1.0, 0.0, 0), "duration must be positive, got 0"),
-        (lambda: exponential(1.0, 0.1, -1), "duration must be .*, got -1"),
         (lambda: exponential(1.0, 0.0, 10), "Use a linear one to reach 0"),
         (lambda: make_schedule({"schedule": "cosine"}), "one of .*linear.*, got 'cosine'"),
-        (lambda: make_schedule({"start": 1.0}), "got None"),
         (lambda: make_schedule({"schedule": "linear", "start": 1.0}), "Wrong arguments.*'end'"),
         (lambda: TemperatureScheduler(Loss(), tua=constant(1.0)), r"no temperature 'tua'.*'tau'"),
-        (lambda: linear(1.0, 0.0, math.nan), "duration must be .*, got nan"),
-        (lambda: linear(0.5, -1.0, 5), "end must be at least 0 and finite, got -1"),
-        (lambda: linear("a", 0.0, 5), "start must be a number, got 'a'"),
-        (lambda: constant(math.inf), "value must be .*finite, got inf"),
-        (lambda: make_schedule("high"), "no mapping must be a number, got 'high'"),
-        (lambda: make_schedule({"schedule": ["linear"]}), r"one of .*got \['linear'\]"),
-        (lambda: theorem1_schedules(1), "num_trajectories must be at least 2"),
-        (
-            lambda: TemperatureScheduler(Loss()).step(-1),
-            "count must be at least 0 and finite, got -1",
-        ),
-        (lambda: TemperatureScheduler(Loss()).step(math.nan), "count must be at least 0 .*got nan"),
     ],
 )
 def test_bad_input_is_refused(make, message):

@@ -9,14 +9,11 @@ from __future__ import annotations
 import csv
 import dataclasses
 import doctest
-import importlib
 import json
 import os
 import re
 import signal
-import sys
 import time
-from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -31,7 +28,7 @@ from torchrl_ecpo.experiment import options
 
 ROOT = Path(__file__).parents[1]
 STUDY, COMMITTED = ROOT / "sota-implementations/study", ROOT / "docs"
-MODULES = ("manifest", "records", "results", "scores", "run", "collect", "report")
+MODULES = sorted(path.stem for path in STUDY.glob("*.py"))
 
 COUNTER = r"""
 import json, os, pathlib, sys, time, yaml
@@ -61,17 +58,10 @@ pathlib.Path("summary.json").write_text(json.dumps(summary))
 
 
 @pytest.fixture(scope="module")
-def study():
-    """The modules of the study, which are scripts beside each other."""
-    sys.path.insert(0, str(STUDY))
-    try:
-        modules = {name: importlib.import_module(name) for name in MODULES}
-        modules["scores"].REPETITIONS = 200
-        yield SimpleNamespace(**modules)
-    finally:
-        sys.path.remove(str(STUDY))
-        for name in MODULES:
-            sys.modules.pop(name, None)
+def study(study):
+    """With a bootstrap that takes little time."""
+    study.scores.REPETITIONS = 200
+    return study
 
 
 @pytest.fixture
@@ -659,11 +649,11 @@ def test_runs_with_other_options_than_the_manifest_now_has_do_not_count(study, t
     entry = manifest.studies["s"]
     results = study.results.Results.read(tmp_path / "results/study/s")
     (cell,) = manifest.cells(entry)
-    assert len(study.report.read_cell(cell, results).runs) == 2
+    assert len(study.results.read_cell(cell, results).runs) == 2
     other = dataclasses.replace(cell, options=("name=one", "speed=9"))
-    assert study.report.read_cell(other, results).runs == {}
+    assert study.results.read_cell(other, results).runs == {}
     longer = dataclasses.replace(cell, steps=200)
-    assert study.report.read_cell(longer, results).unfinished == 2
+    assert study.results.read_cell(longer, results).unfinished == 2
 
 
 def test_what_was_never_measured_and_scales_below_zero_spoil_no_report(study, tmp_path, counter):
@@ -695,7 +685,7 @@ def test_the_report_writes_the_committed_sections(study, monkeypatch, tmp_path):
     for name, entry in manifest.studies.items():
         if name in quick or entry.kind == "ranking":
             section = study.report.section(
-                entry, study.report.read_cells(manifest, entry), tmp_path
+                entry, study.results.read_cells(manifest, entry), tmp_path
             )
             assert f"\n\n{section}\n" in page, name
     assert len(list((tmp_path / "figures/study").iterdir())) == 6
@@ -713,19 +703,6 @@ def test_make_report_writes_the_committed_page_byte_for_byte(study, monkeypatch,
     assert_pictures_are_committed(tmp_path / "figures/study")
 
 
-@pytest.fixture(scope="module")
-def committed(study):
-    """Committed results of a study, by title of the task and method."""
-    manifest = study.manifest.read_manifests()
-
-    @lru_cache
-    def read(name):
-        cells = study.report.read_cells(manifest, manifest.studies[name])
-        return {(result.title, result.cell.method): result for result in cells}
-
-    return read
-
-
 STATED = re.compile(r"(-?[\d,.]+) ± ([\d,.]+)(?: \((.+)\))?")
 
 
@@ -737,11 +714,12 @@ STATED = re.compile(r"(-?[\d,.]+) ± ([\d,.]+)(?: \((.+)\))?")
         ("README.md", ("figure2",), r"task[^|]*(?:\| runs )?\| ECAC"),
     ],
 )
-def test_the_tables_of_results_state_what_is_committed(study, committed, page, names, heading):
+def test_the_tables_of_results_state_what_is_committed(study, page, names, heading):
     tables = re.findall(rf"^\| {heading}.*\n(?:\|.*\n)+", (ROOT / page).read_text(), re.M)
     (lines,) = ([line[2:-2].split(" | ") for line in table.splitlines()] for table in tables)
     header, _, *rows = lines
-    results = {key: result for name in names for key, result in committed(name).items()}
+    committed = [result for name in names for result in study.claims.committed(name).values()]
+    results = {(result.title, result.cell.method): result for result in committed}
     assert len(rows) == len({title for title, _ in results})
     assert {method for _, method in results} <= set(header)
     for row in rows:
@@ -768,12 +746,6 @@ def assert_stated(study, result, stated):
         assert brackets == study.report.scores("", result.scored, threshold)[-2]
     elif brackets is not None:
         assert brackets == ", ".join(f"{value:,.0f}" for value in finals)
-
-
-def test_in_the_first_study_ecpo_has_the_largest_areas(study, committed):
-    for name in ("first_bandit", "first_tasks"):
-        areas = {key: study.scores.area(*r.scored).mean() for key, r in committed(name).items()}
-        assert all(areas[title, "ECPO"] >= area for (title, _), area in areas.items())
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/results.md"])

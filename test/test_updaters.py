@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 import re
 
 import pytest
@@ -16,7 +15,6 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import (
     DDPGLoss,
     LossModule,
-    ReinforceLoss,
     SACLoss,
     SoftUpdate,
     TargetNetUpdater,
@@ -68,12 +66,6 @@ def ddpg(*, delay_actor: bool = True, delay_value: bool = True) -> DDPGLoss:
     actor = TensorDictModule(net, in_keys=["observation"], out_keys=["action"])
     critic = ValueOperator(QNetwork(norm=True), in_keys=["observation", "action"])
     return DDPGLoss(actor, critic, delay_actor=delay_actor, delay_value=delay_value)
-
-
-def reinforce() -> ReinforceLoss:
-    """Without delayed networks."""
-    value = ValueOperator(nn.Linear(OBSERVATIONS, 1), in_keys=["observation"])
-    return ReinforceLoss(stochastic_actor(), value)
 
 
 every_loss = pytest.mark.parametrize("make_loss", [sac, ddpg])
@@ -285,20 +277,10 @@ class TestErrors:
                 "['actor_network', 'qvalue_network']",
             ),
             (
-                lambda: sac(delay_actor=False),
-                ("actor_network",),
-                "['actor_network'] of SACLoss: its delayed networks are ['qvalue_network']",
-            ),
-            (
                 lambda: ddpg(delay_actor=False, delay_value=False),
                 (),
                 "a network of DDPGLoss: its delayed networks are []. A network is delayed by an "
                 "argument of the loss, such as delay_actor=True",
-            ),
-            (
-                reinforce,
-                ("critic_network",),
-                "['critic_network'] of ReinforceLoss: its delayed networks are []",
             ),
             (sac, ("actor_network", "actor_network"), "A network is named twice"),
         ],
@@ -307,17 +289,10 @@ class TestErrors:
         with pytest.raises(ValueError, match=re.escape(message)):
             PolyakAverage(make_loss(), *networks)
 
-    @pytest.mark.parametrize(
-        ("make", "name", "value", "message"),
-        [
-            *((PeriodicCopy, "interval", v, "must be an integer") for v in (0, 2.0, True, None)),
-            *((PolyakAverage, "weight", v, r"must be in \(0, 1\]") for v in (0, 1.1, math.nan)),
-            (PolyakAverage, "weight", "high", "must be a number"),
-        ],
-    )
-    def test_options(self, make, name, value, message):
-        with pytest.raises(ValueError, match=f"{name} {message}.*got {value!r}"):
-            make(ddpg(), "actor_network", **{name: value})
+    @pytest.mark.parametrize("weight", [0, 1.1])
+    def test_weights_at_the_edges(self, weight):
+        with pytest.raises(ValueError, match=rf"weight must be in \(0, 1\], got {weight}"):
+            PolyakAverage(ddpg(), "actor_network", weight=weight)
 
     def test_targets_that_require_a_gradient(self):
         loss = sac()
@@ -366,8 +341,6 @@ class TestUpdaterSequence:
     @pytest.mark.parametrize(
         ("make_updaters", "message"),
         [
-            (lambda a, b: [], "updaters, at least one"),
-            (lambda a, b: [PolyakAverage(a), a], "must be TargetNetUpdaters, got SACLoss"),
             (lambda a, b: [PolyakAverage(a), PolyakAverage(b)], "must belong to one loss"),
             (
                 lambda a, b: [PolyakAverage(a), PeriodicCopy(a, "actor_network", interval=2)],
@@ -429,9 +402,7 @@ class TestCheckpoints:
         refused = [
             (copies, averages.state_dict(), r"PeriodicCopy has the entries \['counter', 'init"),
             (averages, copies.state_dict(), r"PolyakAverage has the entries \['initialized'\]"),
-            (copies, {}, r"got \[\]"),
             (half, averages.state_dict(), r"entries \['averages', 'initialized'\], got \['ini"),
-            (half, half.state_dict() | {"averages": {}}, r"averages of .*'actor_network.*missing"),
             (sequence, copies.state_dict(), "one entry, 'updaters', with 2 states"),
             (sequence, {"updaters": [copies.state_dict()]}, "one entry, 'updaters', with 2"),
         ]

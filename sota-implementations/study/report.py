@@ -8,14 +8,13 @@ from __future__ import annotations
 import statistics
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from manifest import SCRIPTS, Cell, Manifest, Study, argument_parser, read_manifests
+from manifest import SCRIPTS, Manifest, Study, argument_parser, read_manifests
 from matplotlib.figure import Figure
-from results import RESULTS, Point, Results, recorded
+from results import RESULTS, CellResult, read_cells
 from scores import (
     Estimate,
     area,
@@ -25,7 +24,7 @@ from scores import (
     steps_to_solve,
 )
 
-from torchrl_ecpo.experiment.compare import Curve, align
+from torchrl_ecpo.experiment.compare import Curve
 from torchrl_ecpo.experiment.figures import plot_comparison, save_figure
 
 DOCS = SCRIPTS.parent / "docs"
@@ -75,74 +74,6 @@ How to read the tables:
   Where the interval has 0.5 in it, the runs leave open which is better. With two or three runs
   intervals are too narrow.
 """
-
-
-@dataclass(frozen=True)
-class CellResult:
-    """What is known of a cell."""
-
-    cell: Cell
-    runs: dict[int, dict[str, str]]
-    """By seed, of those planned: the runs that made all steps."""
-    unfinished: int
-    """Runs that did not."""
-    curves: dict[int, list[Point]]
-
-    @property
-    def title(self) -> str:
-        """Of the task."""
-        return self.cell.task.title or self.cell.task.name
-
-    @property
-    def count(self) -> str:
-        """Runs that there are; of how many, if there should be more."""
-        planned = len(self.cell.seeds)
-        return (
-            f"{len(self.runs)}" if len(self.runs) == planned else f"{len(self.runs)} of {planned}"
-        )
-
-    def curve(self, metric: str) -> Curve | None:
-        """None if no run has the metric."""
-        points = [
-            [(point["step"], point[metric]) for point in self.curves[seed] if metric in point]
-            for seed in sorted(self.runs)
-        ]
-        measured = [np.array(pairs) for pairs in points if pairs]
-        return align(measured, self.cell.name) if measured else None
-
-    @cached_property
-    def scored(self) -> Curve | None:
-        """The task's own metric."""
-        return self.curve(self.cell.task.metric)
-
-    @cached_property
-    def finals(self) -> np.ndarray:
-        """The final score of each run, ``[runs]``."""
-        return np.empty(0) if self.scored is None else final(*self.scored)
-
-
-def read_cells(manifest: Manifest, study: Study, results: Path = RESULTS) -> list[CellResult]:
-    """What was collected of a study in a folder of results."""
-    collected = Results.read(results / "study" / study.name)
-    return [read_cell(cell, collected) for cell in manifest.cells(study)]
-
-
-def read_cell(cell: Cell, results: Results) -> CellResult:
-    """The results of a cell; a run with other options than the cell's now is none of it."""
-    options, complete, unfinished = " ".join(cell.options), {}, 0
-    curves = {}
-    for seed in cell.seeds:
-        key = (cell.task.name, cell.method, cell.label, seed)
-        run = results.runs.get(key)
-        if run is None or run["options"] != options:
-            continue
-        if recorded(run) < cell.steps:
-            unfinished += 1
-            continue
-        complete[seed] = run
-        points = results.curves.get(key, [])  # none, if nothing was ever measured
-        curves[seed] = [point for point in points if point["step"] <= cell.steps]
-    return CellResult(cell, complete, unfinished, curves)
 
 
 # ------------------------------------------------------------------------------------------ tables

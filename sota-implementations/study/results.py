@@ -1,4 +1,4 @@
-"""What is committed of a study: the table of its runs, their curves, each cell's configuration."""
+"""What is committed of a study: its runs, their curves, each cell's configuration; its reader."""
 
 from __future__ import annotations
 
@@ -7,12 +7,16 @@ import itertools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from manifest import SCRIPTS, Cell, changed_entries
+from manifest import SCRIPTS, Cell, Manifest, Study, changed_entries
 from records import Record
+from scores import final
+
+from torchrl_ecpo.experiment.compare import Curve, align
 
 RESULTS = SCRIPTS / "results"
 # Of a curve: each is the mean over a hundredth of the run.
@@ -115,6 +119,74 @@ class Results:
 def recorded(run: Mapping[str, str]) -> int:
     """Up to which step the curve of a run goes: no further than its cell did when it was taken."""
     return min(int(run["reached"]), int(run["steps"]))
+
+
+@dataclass(frozen=True)
+class CellResult:
+    """What is known of a cell."""
+
+    cell: Cell
+    runs: dict[int, dict[str, str]]
+    """By seed, of those planned: the runs that made all steps."""
+    unfinished: int
+    """Runs that did not."""
+    curves: dict[int, list[Point]]
+
+    @property
+    def title(self) -> str:
+        """Of the task."""
+        return self.cell.task.title or self.cell.task.name
+
+    @property
+    def count(self) -> str:
+        """Runs that there are; of how many, if there should be more."""
+        planned = len(self.cell.seeds)
+        return (
+            f"{len(self.runs)}" if len(self.runs) == planned else f"{len(self.runs)} of {planned}"
+        )
+
+    def curve(self, metric: str) -> Curve | None:
+        """None if no run has the metric."""
+        points = [
+            [(point["step"], point[metric]) for point in self.curves[seed] if metric in point]
+            for seed in sorted(self.runs)
+        ]
+        measured = [np.array(pairs) for pairs in points if pairs]
+        return align(measured, self.cell.name) if measured else None
+
+    @cached_property
+    def scored(self) -> Curve | None:
+        """The task's own metric."""
+        return self.curve(self.cell.task.metric)
+
+    @cached_property
+    def finals(self) -> np.ndarray:
+        """The final score of each run, ``[runs]``."""
+        return np.empty(0) if self.scored is None else final(*self.scored)
+
+
+def read_cells(manifest: Manifest, study: Study, results: Path = RESULTS) -> list[CellResult]:
+    """What was collected of a study in a folder of results."""
+    collected = Results.read(results / "study" / study.name)
+    return [read_cell(cell, collected) for cell in manifest.cells(study)]
+
+
+def read_cell(cell: Cell, results: Results) -> CellResult:
+    """The results of a cell; a run with other options than the cell's now is none of it."""
+    options, complete, unfinished = " ".join(cell.options), {}, 0
+    curves = {}
+    for seed in cell.seeds:
+        key = (cell.task.name, cell.method, cell.label, seed)
+        run = results.runs.get(key)
+        if run is None or run["options"] != options:
+            continue
+        if recorded(run) < cell.steps:
+            unfinished += 1
+            continue
+        complete[seed] = run
+        points = results.curves.get(key, [])  # none, if nothing was ever measured
+        curves[seed] = [point for point in points if point["step"] <= cell.steps]
+    return CellResult(cell, complete, unfinished, curves)
 
 
 def thin(columns: Mapping[str, Sequence[float]], metrics: Sequence[str], steps: int) -> list[Point]:

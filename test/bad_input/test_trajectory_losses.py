@@ -23,6 +23,9 @@ SUBJECTS = CASES | {
     "reps": Case(REPSLoss, {"tau": 0.7, "tau_prime": 0.3}, ecpo, {"epsilon": 0.4}),
     "trust_pcl": SimpleNamespace(loss=TrustPCLLoss, temperatures=TEMPERATURES, options={}),
 }
+WHOLE = ("ecpo", "grpo", "trust_pcl")
+"""Of these the networks and the batch are spoilt too, which the base reads for all: sums of each
+trajectory, single steps, and a value network."""
 NAMES = "names of groups, which agree within each"
 FINE = {("group", fault): NAMES for fault in ("text", "halves", "flags")}
 
@@ -37,7 +40,7 @@ def good(kind, *, dtype=torch.float64):
     }
 
 
-def call(case, kind):
+def call(case):
     def run(entries):
         options = {name: entries[name] for name in OPTIONS if name in entries}
         networks = {name: entries[name]() for name in NETWORKS if name in entries}
@@ -63,10 +66,12 @@ def subject(name, kind):
         del options["score"]  # it is of rewards, not of returns
     networks = dict.fromkeys(NETWORKS[: 1 + (name == "trust_pcl")], NO_NETWORKS)
     made = {"actor_network": lambda: make_actor(kind), "value_network": make_value}
-    entries = good(kind) | options | {network: made[network] for network in networks}
+    others, run = good(kind) | {network: made[network] for network in networks}, call(case)
+    if name not in WHOLE:
+        return Subject(lambda entries: run({**others, **entries}), options, optional=options)
     return Subject(
-        call(case, kind),
-        entries,
+        run,
+        others | options,
         faults=networks,
         fine=FINE,
         optional=(MASK, "group", *options),
@@ -74,6 +79,11 @@ def subject(name, kind):
 
 
 @pytest.mark.parametrize("kind", ["categorical", "normal"])
-@pytest.mark.parametrize("name", SUBJECTS)
+@pytest.mark.parametrize("name", WHOLE)
 def test_trajectory_losses(name, kind):
     check(f"`{SUBJECTS[name].loss.__name__}`, {kind} policy", subject(name, kind))
+
+
+@pytest.mark.parametrize("name", [name for name in SUBJECTS if name not in WHOLE])
+def test_options_of_trajectory_losses(name):
+    check(f"`{SUBJECTS[name].loss.__name__}`, options", subject(name, "categorical"))

@@ -514,16 +514,11 @@ def test_group_ids_are_unique():
     ("arguments", "message"),
     [
         ({"task": "sort"}, "Unknown task 'sort'.*copy, duplicated_input.*reversed_addition3"),
-        ({"num_groups": 0}, "num_groups must be an integer of at least 1, got 0"),
-        ({"group_size": -1}, "group_size must be an integer of at least 1, got -1"),
         ({"min_length": 31}, r"min_length of copy must lie in 1\.\.30, got 31"),
         (
             {"task": "duplicated_input", "min_length": 1},
             r"min_length of duplicated_input must lie in 2\.\.30, got 1",
         ),
-        ({"task": ["copy"]}, r"Unknown task \['copy'\]"),
-        ({"seed": 1.5}, "seed must be an integer of at least 0, got 1.5"),
-        ({"curriculum": "row"}, "curriculum must be 'group', 'batch', 'gym' or None, got 'row'"),
     ],
 )
 def test_bad_arguments_are_refused(arguments, message):
@@ -534,10 +529,8 @@ def test_bad_arguments_are_refused(arguments, message):
 @pytest.mark.parametrize(
     ("task", "instance", "message"),
     [
-        ("copy", torch.zeros(2, 3, dtype=torch.int64), r"shape \[1, 2, L\].*got \[2, 3\]"),
         ("copy", torch.zeros(1, 2, 0, dtype=torch.int64), r"L in 1\.\.32, got \[1, 2, 0\]"),
         ("copy", torch.zeros(1, 2, 33, dtype=torch.int64), r"L in 1\.\.32, got \[1, 2, 33\]"),
-        ("copy", torch.zeros(1, 2, 3), "dtype torch.int64, got torch.float32"),
         ("copy", torch.tensor([[[1, 2], [5, 1]]]), r"characters in 0\.\.4, .* got \[5, 1, -1"),
         ("copy", torch.tensor([[[1, 2], [-1, -1]]]), r"at least one, .* got \[-1, -1"),
         ("copy", torch.tensor([[[1, 2, 0], [1, -1, 1]]]), r"then -1 as padding, .* got \[1, -1, 1"),
@@ -564,8 +557,6 @@ def test_malformed_instances_are_refused(task, instance, message):
     [
         ([2, 0, 0], r"of copy must lie between \[0, 0, 0\] and \[1, 1, 4\], got \[2, 0, 0\]"),
         ([0, -1, 0], r"got \[0, -1, 0\]"),
-        ([0, 0], r"int64 of shape \[1, 2, 3\], got torch.int64 of shape \[1, 2, 2\]"),
-        ([0.0, 0.0, 0.0], "int64 of shape .* got torch.float32"),
     ],
 )
 def test_actions_outside_the_spec_are_refused(action, message):

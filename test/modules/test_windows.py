@@ -237,17 +237,10 @@ def test_the_loss_finds_the_probabilities_that_were_sampled(window: int) -> None
     collector.shutdown()
 
 
-@pytest.mark.parametrize(
-    ("window", "message"),
-    [
-        (0, "window must be an integer of at least 1, got 0"),
-        (1.5, "window must be an integer of at least 1, got 1.5"),
-        (8, r"window: expected at most 2\^62 different windows, got 325\^8"),
-    ],
-)
-def test_windows_refused(window: Any, message: str) -> None:
+def test_windows_that_cannot_be_counted() -> None:
+    message = r"window: expected at most 2\^62 different windows, got 325\^8"
     with pytest.raises(ValueError, match=message):
-        copy_policy(window)
+        copy_policy(8)
 
 
 def test_what_a_step_lacks_is_named() -> None:

@@ -10,7 +10,6 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictParams
 from tensordict.nn import (
-    ProbabilisticTensorDictSequential,
     TensorDictModule,
     set_composite_lp_aggregate,
 )
@@ -271,22 +270,6 @@ def test_to_dtype(dtype):
         assert isinstance(cast.actor_network_params, TensorDictParams)
         assert len(list(cast.parameters())) == 2
         assert all(isinstance(p, torch.nn.Parameter) for p in cast.parameters())
-
-
-def test_stateful_net():
-    """A working actor comes out, a copy by default, and its parameters go back in."""
-    loss = build()
-    net = loss.get_stateful_net("actor_network")
-    assert isinstance(net, ProbabilisticTensorDictSequential)
-    batch = sample(make_actor(), 2, 3, 4)
-    assert_close(
-        net.get_dist(batch.clone()).log_prob(batch["action"]).detach(), batch["action_log_prob"]
-    )
-    other = make_actor()
-    move(other)
-    loss.from_stateful_net("actor_network", other)
-    assert_close(list(loss.parameters()), list(other.parameters()))
-    assert loss.get_stateful_net("actor_network", copy=False) is loss.actor_network
 
 
 @losses

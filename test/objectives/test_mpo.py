@@ -41,8 +41,11 @@ def test_tau_is_where_the_dual_is_least(epsilon, tau_prime):
         at = torch.tensor(log_tau, dtype=torch.float64, requires_grad=True)
         (expected,) = torch.autograd.grad(dual(at), at)
         assert_close(slope(log_tau)[0], expected / (at.exp() * epsilon))
-    grid = torch.linspace(-6.0, 2.0, 8001, dtype=torch.float64)
-    least = grid[torch.stack([dual(at) for at in grid]).argmin()]
+    low, high = -6.0, 2.0
+    for _ in range(4):  # the dual has one minimum
+        grid = torch.linspace(low, high, 41, dtype=torch.float64)
+        least = grid[torch.stack([dual(at) for at in grid]).argmin()]
+        low, high = (least.item() + step * (high - low) / 40 for step in (-1, 1))
     slopes = [slope(least + step)[0].item() for step in (-1e-3, 1e-3)]
     assert slopes[0] < 0 < slopes[1]
     assert_close(slope(least)[1].item(), epsilon, rtol=0.005, atol=0)
@@ -85,9 +88,7 @@ def test_a_temperature_at_its_floor_stays_there():
         ({"epsilon": 0.0}, r"epsilon must be above 0 and below 3, in nats.*got 0\.0"),
         ({"epsilon": 1.4, "num_action_samples": 4}, r"below 1\.39.*num_action_samples=4.*got 1\.4"),
         ({"num_action_samples": 1}, "epsilon must be above 0 and below 0.*num_action_samples=1"),
-        ({"epsilon_mean": -1}, r"epsilon_mean must be above 0.*got -1\.0"),
-        ({"epsilon_scale": float("nan")}, "epsilon_scale must be above 0.*got nan"),
-        ({"epsilon_scale": "wide"}, "epsilon_scale must be a number, got 'wide'"),
+        ({"epsilon_mean": 0}, r"epsilon_mean must be above 0.*got 0\.0"),
         ({"target_kl": 0.1}, r"MPO's lift has the bound epsilon; got .*target_kl.*0\.1"),
         ({"tau": 0.1, "min_tau": 0.2}, "learned tau must start at min_tau"),
     ],
