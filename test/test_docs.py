@@ -130,8 +130,15 @@ def compose_command(script: Path, options: str) -> None:
         OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if python_blocks(page)], ids=name)
-def test_examples_run(page, tmp_path, monkeypatch):
+EXAMPLES = [
+    pytest.param(page, marks=[pytest.mark.slow] if "ray_init_config" in blocks else [])
+    for page in PAGES
+    if (blocks := "".join(python_blocks(page)))
+]
+
+
+@pytest.mark.parametrize("page", EXAMPLES, ids=name)
+def test_examples_run(page, tmp_path, monkeypatch, torchrl_configs):
     # As from the repository, but what they write stays out of it.
     for folder in ("docs", "sota-implementations"):
         (tmp_path / folder).symlink_to(ROOT / folder)

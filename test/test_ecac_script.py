@@ -155,6 +155,18 @@ def test_tasks_collectors_and_ablations_run(tmp_path, options):
         assert metrics["tau"][1:] == pytest.approx([0.15, 0.1], abs=0.01)
 
 
+@pytest.mark.parametrize("loss", [None, "discrete_pmd_ac"])
+def test_one_discrete_action_has_a_loss_of_its_own(tmp_path, loss):
+    options = ["env=gym", "env.name=CartPole-v1"] + ([f"loss={loss}"] if loss else [])
+    process = start(tmp_path, *TINY[:-1], f"hydra.run.dir={tmp_path}", *options)
+    assert process.returncode == 0, process.stderr
+    assert OmegaConf.load(tmp_path / "config.yaml").loss.name == (loss or "discrete_ecac")
+    metrics = read_metrics(tmp_path)
+    assert metrics["step"][-1] == 240
+    assert all(map(math.isfinite, metrics["loss_actor"][1:]))
+    assert 0.6 < metrics["entropy"][-1] <= math.log(2) + 1e-6
+
+
 @pytest.fixture
 def utils(monkeypatch):
     monkeypatch.syspath_prepend(str(SCRIPT))
@@ -169,25 +181,68 @@ def utils(monkeypatch):
     ("overrides", "message"),
     [
         (["env=gym", "env.name=Chess-v0"], "env.name=Chess-v0 is no task of gymnasium"),
-        (["env=gym", "env.name=CartPole-v1"], "must be of bounded continuous actions"),
+        (["env=gym", "env.name=CartPole-v1"], "loss=ecac does not go with env.name=CartPole-v1.*"),
+        (["env=pendulum", "loss=discrete_ecac"], "loss=discrete_ecac does not go with"),
         (["env=dm_control", "env.task=fly"], "env.name=cheetah env.task=fly cannot be made"),
         (["~loss.lr.log_tau"], "loss.lr must have a learning rate for each of"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
 def test_bad_options_end_with_a_clear_message(utils, overrides, message):
-    config = configure([*TINY, *overrides])
+    config = configure([*tiny(overrides), *overrides])
     with pytest.raises(ValueError, match=message):  # noqa: PT012 - the script's first steps
         env = utils.make_environment(config, seed=0)
         loss_module = utils.make_loss(config, utils.make_actor(config, env), env)
         utils.make_optimizer(config.loss.lr, loss_module)
 
 
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ("env=gym env.name=CartPole-v1 seed=1", ["loss=discrete_ecac"]),
+        ("env=gym env.name=CartPole-v1 loss=pmd_ac", []),
+        ("env=gym env.name=Pendulum-v1", []),
+        ("env=gym env.name=Chess-v0", []),
+        ("env=gym", []),
+        ("env=pendulum", []),
+    ],
+)
+def test_the_loss_is_that_of_the_actions_unless_it_is_given(utils, options, expected):
+    assert utils.chosen_loss(options.split()) == expected
+
+
+def test_pixels_are_read_by_networks_of_convolutions(utils, monkeypatch):
+    class Screen(gym.Env):
+        observation_space = gym.spaces.Box(0, 255, (9, 10, 3), "uint8")
+        action_space = gym.spaces.Discrete(3)
+        spec = None
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return self.observation_space.sample(), {}
+
+        def step(self, action):
+            return self.observation_space.sample(), 1.0, False, False, {}
+
+    monkeypatch.setattr(utils.gym, "make", lambda name, **options: Screen())
+    config = configure(["env=gym", "env.name=Screen", "loss=discrete_ecac"])
+    env = utils.make_environment(config, seed=0)
+    actor = utils.make_actor(config, env)
+    loss_module = utils.make_loss(config, actor, env)
+    utils.make_updater(config, loss_module)
+    steps = env.rollout(4, actor).select(*loss_module.in_keys, strict=False)
+    assert {*steps.keys()} == {"observation", "action", "next"}
+    losses = loss_module(steps)
+    (losses["loss_actor"] + losses["loss_qvalue"]).backward()
+    for name, parameter in loss_module.named_parameters():
+        assert name == "log_tau" or parameter.grad.isfinite().all()
+
+
 def test_a_missing_simulator_is_named_with_its_extra(utils, monkeypatch):
     def fail(name, **options):
         raise gym.error.DependencyNotInstalled("No mujoco.")
 
-    monkeypatch.setattr(utils, "GymEnv", fail)
+    monkeypatch.setattr(utils.gym, "make", fail)
     config = configure(["env=gym", "env.name=Ant-v5"])
     with pytest.raises(ModuleNotFoundError, match=r"Ant-v5 .* pip install '\.\[mujoco\]'"):
         utils.make_environment(config, seed=0)
@@ -201,13 +256,13 @@ def test_a_missing_simulator_is_named_with_its_extra(utils, monkeypatch):
     ],
 )
 def test_a_video_that_cannot_be_drawn_says_what_to_install(utils, monkeypatch, error, message):
-    class Env(utils.GymEnv):
-        def __init__(self, name, *, from_pixels, **options):
+    class Env(utils.GymWrapper):
+        def __init__(self, env, *, from_pixels, **options):
             if from_pixels:
                 raise error from ImportError("pygame")
-            super().__init__(name)
+            super().__init__(env)
 
-    monkeypatch.setattr(utils, "GymEnv", Env)
+    monkeypatch.setattr(utils, "GymWrapper", Env)
     config = configure(["evaluation.video=true"])
     with pytest.raises(RuntimeError, match=f"evaluation.video=true cannot draw {message}"):
         utils.make_environment(config, seed=0, is_evaluation=True)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import importlib
 import json
 import math
+import os
 import shutil
 import sys
 from itertools import pairwise
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -27,7 +29,7 @@ def start(directory, *overrides, afresh=False):
     flags = [override for override in overrides if override.startswith("--")]
     options = [override for override in overrides if override not in flags]
     tiny = () if any(option.startswith("env=") for option in options) else TINY
-    afresh = afresh or "collector=ray" in options or "hydra/launcher=joblib" in options
+    afresh = afresh or "collector=ray" in options or "hydra/launcher" in " ".join(options)
     return run_script(directory, ECPO, *flags, *tiny, *options, afresh=afresh)
 
 
@@ -165,12 +167,18 @@ def test_a_run_stops_once_it_holds_its_goal_and_is_finished(tmp_path):
 
 
 @pytest.mark.slow  # each of the two processes imports torch
-def test_a_sweep_over_two_processes_gives_the_metrics_of_single_runs(sweep, tmp_path):
+@pytest.mark.parametrize(
+    "launcher", [("joblib", "hydra.launcher.n_jobs=2"), ("submitit_local",)], ids=lambda own: own[0]
+)
+def test_a_sweep_over_two_processes_gives_the_metrics_of_single_runs(
+    sweep, tmp_path, monkeypatch, launcher
+):
+    monkeypatch.setenv("PYTHONPATH", str(ECPO.parent), prepend=os.pathsep)  # for submitit
     run_ecpo(
         tmp_path,
         "--multirun",
-        "hydra/launcher=joblib",
-        "hydra.launcher.n_jobs=2",
+        f"hydra/launcher={launcher[0]}",
+        *launcher[1:],
         "loss=ecpo,ment",
         "form=paper",
         "seed=5",
@@ -219,6 +227,156 @@ def test_every_kind_of_task_runs(tmp_path, options):
     metrics = read_metrics(tmp_path)
     assert metrics["step"][-1] >= 40
     assert all(math.isfinite(loss) for loss in metrics["loss_actor"])
+
+
+def test_the_toy_tasks_of_gymnasium_train(tmp_path):
+    """Their observations are numbers, and tuples of these, and vectors."""
+    names = ("FrozenLake-v1", "Blackjack-v1", "CliffWalking-v1", "Taxi-v4", "Acrobot-v1")
+    check_training(tmp_path, names)
+
+
+OWN_TASKS = """
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+class Own(gym.Env):
+    observation_space = spaces.Dict(at=spaces.Box(-1, 1, (2,)), kind=spaces.Discrete(3))
+
+    def __init__(self, actions, observations=observation_space, is_noisy=False):
+        self.action_space, self.observation_space = actions, observations
+        self.is_noisy = is_noisy
+
+    def _observe(self):
+        if not self.is_noisy:
+            self.observation_space.seed(int(self.np_random.integers(1000)))
+        return self.observation_space.sample()
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self._observe(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        reward = float(spaces.flatten(self.action_space, action)[0])
+        return self._observe(), reward, False, False, {}
+
+number, choice = spaces.Box(-1, 1, (1,), np.float32), spaces.Discrete(2)
+pixels = spaces.Box(0, 255, (20, 24, 3), np.uint8)
+for name, options in {
+    "Mixed": {"actions": spaces.Dict(a=choice, b=number)},
+    "Several": {"actions": spaces.Tuple([choice, spaces.MultiDiscrete([3, 2])])},
+    "Numbers": {"actions": spaces.Tuple([number, number])},
+    "Pixels": {"actions": choice, "observations": pixels},
+    "Graph": {"actions": choice, "observations": spaces.Graph(number, None)},
+    "Noisy": {"actions": choice, "is_noisy": True},
+}.items():
+    gym.register(f"{name}-v0", entry_point=Own, kwargs=options)
+"""
+
+
+@pytest.fixture
+def own_tasks(tmp_path, monkeypatch):
+    """A module of one's own, and its path."""
+    (tmp_path / "own_tasks.py").write_text(OWN_TASKS)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv(
+        "PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    )
+    known = dict(gym.registry)
+    yield "own_tasks"
+    sys.modules.pop("own_tasks", None)
+    gym.registry.clear()
+    gym.registry.update(known)
+
+
+def test_tasks_of_ones_own_train(tmp_path, own_tasks):
+    names = [f"{own_tasks}:{name}-v0" for name in ("Mixed", "Several", "Numbers", "Pixels")]
+    check_training(tmp_path, names, afresh=True)
+
+
+@pytest.mark.parametrize(
+    "name", ["CarRacing-v3", pytest.param("minigrid:MiniGrid-DoorKey-5x5-v0", id="DoorKey")]
+)
+@pytest.mark.slow
+def test_tasks_of_extras_train(tmp_path, name):
+    pytest.importorskip("Box2D" if name == "CarRacing-v3" else "minigrid")
+    check_training(tmp_path, [name])
+
+
+def check_training(directory, names, **options):
+    """One batch of one group of three, and then one of the policy that came of it."""
+    run_ecpo(
+        directory,
+        "--multirun",
+        "env=gym",
+        f"env.name={','.join(names)}",
+        "env.max_steps=4",
+        "num_groups=1",
+        "group_size=3",
+        "total_trajectories=6",
+        "evaluation_interval=1",
+        f"hydra.sweep.dir={directory}",
+        "hydra.sweep.subdir=${hydra:job.num}",
+        **options,
+    )
+    for index, _ in enumerate(names):
+        metrics = read_metrics(directory / str(index))
+        assert metrics["step"] == [3, 6]
+        for name in ("loss_actor", "greedy_return", "entropy"):
+            assert all(map(math.isfinite, metrics[name])), (names[index], name)
+        assert metrics["kl_reference_policy"] == pytest.approx([0, 0], abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("Graph", "env.name: Graph-v0 observes Graph.*TransformObservation"),
+        ("Noisy", "two copies of a problem instance differ at their start"),
+        ("Missing", "env.name=own_tasks:Missing-v0 is no task of gymnasium"),
+    ],
+)
+def test_a_task_that_cannot_be_played_is_refused_at_the_door(
+    script_modules, own_tasks, name, message
+):
+    with pytest.raises(ValueError, match=message):
+        script_modules("utils").check_copies(f"{own_tasks}:{name}-v0")
+
+
+def test_a_task_whose_package_is_not_there_says_so(script_modules):
+    with pytest.raises(ValueError, match=r"env\.name=nowhere:Task-v0 needs what is not installed"):
+        script_modules("tasks").make_copy("nowhere:Task-v0")
+
+
+def test_a_run_without_weights_or_entropy_says_so_once(script_modules, capsys):
+    watch = script_modules("utils").Watch(8, 0.01)
+    good = {"ESS": 4.0, "entropy": 1.0, "length": 2.0}
+    for metrics in [good | {"ESS": 1.4}] * 9 + [good] + [good | {"ESS": 1.4}] * 9:
+        watch(metrics)
+    assert not capsys.readouterr().err
+    for _ in range(30):
+        watch({"ESS": 1.4, "entropy": 0.019, "length": 2.0})
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert lines[0].startswith("ESS stays below 1.5 of 8:")
+    assert lines[1].startswith("The entropy is gone:")
+    for _ in range(30):
+        watch({"entropy": 5.0})  # of a loss without weights, or a task of one step
+    assert not capsys.readouterr().err
+
+
+def test_several_choices_are_drawn_independently(script_modules):
+    logits = torch.tensor([0.2, 0.8, 0.5, 0.25, 0.25]).log()
+    choices = script_modules("tasks").Choices(logits, [2, 3])
+    log_prob = choices.log_prob(torch.tensor([1, 2]))
+    torch.testing.assert_close(log_prob, torch.tensor(0.8 * 0.25).log())
+    assert choices.mode.tolist() == [1, 0]
+    assert int(choices.sample((1000,))[:, 0].max()) == 1
+    uniform = torch.full((5,), 0.0, requires_grad=True)
+    entropy = script_modules("tasks").Choices(uniform, [2, 3]).entropy()
+    torch.testing.assert_close(entropy, torch.tensor(6.0).log())
+    entropy.backward()
+    assert uniform.grad.isfinite().all()
 
 
 def test_compare_names_runs_that_have_not_finished(sweep, tmp_path, capsys):

@@ -13,7 +13,7 @@ from torchrl.objectives import LossModule
 PRIVATE_NAMES: tuple[tuple[object, str], ...] = (
     (LossModule, "_all_schedulable_buffers"),
     (LossModule(), "_has_update_associated"),  # of each instance
-    (EnvBase, "_step_proc_data"),  # overridden by AlgorithmicEnv: saves a tenth of a step
+    (EnvBase, "_step_proc_data"),  # overridden by environments of ours: saves a tenth of a step
     (Storage, "_attached_entities"),
     (Sampler, "_rng"),
     (Collector, "_make_carrier"),  # which makes each instance's `_carrier`

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import hydra
 import torch
 from omegaconf import DictConfig
@@ -17,6 +19,7 @@ from utils import (
     Every,
     Speed,
     check_config,
+    chosen_loss,
     compute_losses,
     evaluate,
     finished_returns,
@@ -147,5 +150,6 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
+    sys.argv += chosen_loss(sys.argv[1:])
     check_command_line(__file__, check_config)
     main()

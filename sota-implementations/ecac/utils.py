@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing, suppress
 from functools import partial
 from typing import Any
 
@@ -17,7 +18,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.collectors import Collector
-from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer
+from torchrl.data import Bounded, Categorical, LazyMemmapStorage, LazyTensorStorage, ReplayBuffer
 from torchrl.envs import (
     CatTensors,
     Compose,
@@ -25,7 +26,7 @@ from torchrl.envs import (
     DoubleToFloat,
     EnvBase,
     ExplorationType,
-    GymEnv,
+    GymWrapper,
     RewardSum,
     StepCounter,
     TransformedEnv,
@@ -35,6 +36,8 @@ from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import DDPGLoss, LossModule, SACLoss, TargetNetUpdater, TD3Loss
 
 from torchrl_ecpo import (
+    DiscreteECACLoss,
+    DiscretePMDACLoss,
     ECACLoss,
     MPOLoss,
     PeriodicCopy,
@@ -46,8 +49,10 @@ from torchrl_ecpo import (
 from torchrl_ecpo._torchrl import carrier_of, generator_of, set_carrier
 from torchrl_ecpo.collectors import SupervisedAsyncCollector, SupervisedSyncCollector
 from torchrl_ecpo.collectors.workers import spawn_seeds
-from torchrl_ecpo.envs import EpisodeReplay
+from torchrl_ecpo.envs import EpisodeReplay, readable
 from torchrl_ecpo.modules import (
+    make_action_value_network,
+    make_categorical_actor,
     make_deterministic_actor,
     make_qvalue_network,
     make_tanh_gaussian_actor,
@@ -57,7 +62,9 @@ from torchrl_ecpo.schedules import make_schedule
 
 LOSSES = {
     "ecac": ECACLoss,
+    "discrete_ecac": DiscreteECACLoss,
     "pmd_ac": PMDACLoss,
+    "discrete_pmd_ac": DiscretePMDACLoss,
     "mpo": MPOLoss,
     "sac": SACLoss,
     "sac_score": ScoreSACLoss,
@@ -68,6 +75,7 @@ ACTORS = {
     "tanh_gaussian": make_tanh_gaussian_actor,
     "tanh_gaussian_small_start": partial(make_tanh_gaussian_actor, final_gain=0.01),
     "deterministic": make_deterministic_actor,
+    "categorical": make_categorical_actor,
 }
 TEMPERATURES = ("tau", "tau_prime")
 SHOWN = ("evaluation_return", "return", "entropy", "alpha", "tau", "tau_prime", "steps_per_second")
@@ -81,6 +89,9 @@ def check_config(config: DictConfig, options: Sequence[str] = ()) -> None:
             "evaluation.interval must be a multiple of log_interval, got "
             f"{config.evaluation.interval} and {config.log_interval}."
         )
+    if config.env.kind == "gym":
+        with closing(_make_gym(config.env)) as env:
+            make_actor(config, env)
     if config.total_frames % config.log_interval:
         raise ValueError(
             "total_frames must be a multiple of log_interval, or the last frames would not be "
@@ -125,13 +136,33 @@ def _make_with_pixels(config: DictConfig, make: Callable[..., EnvBase]) -> EnvBa
         ) from error
 
 
-def _make_gym(config: DictConfig, **options: Any) -> EnvBase:
+def _make_gym(config: DictConfig, *, from_pixels: bool = False, **options: Any) -> EnvBase:
+    """A task of gymnasium, with spaces that the networks can read and play."""
     try:
-        return GymEnv(config.name, **options)
-    except gym.error.DependencyNotInstalled as error:
+        drawn: dict[str, Any] = {"render_mode": "rgb_array"} if from_pixels else {}
+        env = readable(gym.make(config.name, disable_env_checker=True, **drawn))
+    except (gym.error.DependencyNotInstalled, ModuleNotFoundError) as error:
         raise _missing(config.name, error) from error
     except gym.error.Error as error:
-        raise ValueError(f"env.name={config.name} is no task of gymnasium: {error}") from error
+        raise ValueError(
+            f"env.name={config.name} is no task of gymnasium: {error} If another module registers "
+            "it, name that too: env.name=module:Task-v0."
+        ) from error
+    except ValueError as error:
+        raise ValueError(f"env.name: {error}") from error
+    return GymWrapper(env, categorical_action_encoding=True, from_pixels=from_pixels, **options)
+
+
+def chosen_loss(options: Sequence[str]) -> list[str]:
+    """The option ``loss=``, if none is given and a task of gymnasium takes one discrete action."""
+    given = {name: value for name, _, value in (option.partition("=") for option in options)}
+    if "loss" in given or given.get("env") != "gym":
+        return []
+    with suppress(gym.error.Error, ModuleNotFoundError, ValueError):  # which is said later
+        env = readable(gym.make(given.get("env.name", ""), disable_env_checker=True))
+        if isinstance(env.action_space, gym.spaces.Discrete):
+            return ["loss=discrete_ecac"]
+    return []
 
 
 def _make_dm_control(config: DictConfig, **options: Any) -> EnvBase:
@@ -149,7 +180,7 @@ def _make_dm_control(config: DictConfig, **options: Any) -> EnvBase:
 def _missing(task: str, error: Exception) -> ModuleNotFoundError:
     return ModuleNotFoundError(
         f"{task} needs what is not installed: {error} For MuJoCo and dm_control: "
-        "pip install '.[mujoco]' in the repository."
+        "pip install '.[mujoco]' in the repository, likewise box2d and minigrid."
     )
 
 
@@ -158,16 +189,25 @@ def _missing(task: str, error: Exception) -> ModuleNotFoundError:
 
 def make_actor(config: DictConfig, env: EnvBase) -> TensorDictModuleBase:
     """The policy without exploration."""
-    return ACTORS[config.loss.actor](
-        _observation_size(env), env.action_spec_unbatched, hidden_sizes=config.hidden_sizes
-    )
+    spec: Any = env.action_spec_unbatched
+    kind = Categorical if config.loss.actor == "categorical" else Bounded
+    if not isinstance(spec, kind) or (kind is Categorical and spec.ndim):
+        raise ValueError(
+            f"loss={config.loss.name} does not go with env.name={config.env.name}, whose actions "
+            f"are {type(spec).__name__}: one discrete action is for loss=discrete_ecac or "
+            "discrete_pmd_ac, a vector of numbers for the others, and any others for ecpo.py."
+        )
+    return ACTORS[config.loss.actor](_observation_size(env), spec, hidden_sizes=config.hidden_sizes)
 
 
 def make_loss(config: DictConfig, actor: TensorDictModuleBase, env: EnvBase) -> LossModule:
     """The loss that ``loss=`` names, with its critics."""
     action_spec: Any = env.action_spec_unbatched
     sizes = {"hidden_sizes": config.hidden_sizes}
-    critics = [make_qvalue_network(_observation_size(env), action_spec.shape[-1], **sizes)]
+    if isinstance(action_spec, Categorical):
+        critics = [make_action_value_network(_observation_size(env), action_spec.n, **sizes)]
+    else:
+        critics = [make_qvalue_network(_observation_size(env), action_spec.shape[-1], **sizes)]
     if config.loss.value_network:
         critics.append(make_value_network(_observation_size(env), **sizes))
     options = {str(name): value for name, value in config.loss.options.items()}
@@ -254,8 +294,10 @@ def make_policy(config: DictConfig, actor: Any, env: EnvBase) -> TensorDictModul
     return TensorDictSequential(actor, noise)
 
 
-def _observation_size(env: EnvBase) -> int:
-    return env.observation_spec["observation"].shape[-1]
+def _observation_size(env: EnvBase) -> Any:
+    """Length of a vector, or shape of an image."""
+    shape = env.observation_spec["observation"].shape
+    return shape if len(shape) > 1 else shape[0]
 
 
 def _half_range(action_spec: Any) -> float:

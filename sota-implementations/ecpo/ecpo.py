@@ -14,6 +14,7 @@ from stacked import check_runs, runs_of, train_stack
 from tasks import Metrics, make_task
 from torch.nn.utils import clip_grad_norm_
 from utils import (
+    Watch,
     goes_on,
     held,
     is_far,
@@ -50,6 +51,7 @@ def main(config: DictConfig) -> None:
     max_grad_norm = config.optim.max_grad_norm or float("inf")
     temperatures = make_temperatures(config.loss, loss_module)
     run = make_run(config, task)
+    watch = Watch(config.group_size, task.least_entropy)
 
     groups_of_trajectories = iter(collector)
     progress = Progress(
@@ -94,6 +96,7 @@ def main(config: DictConfig) -> None:
                 if progress.project_steps % config.evaluation_interval == 0:
                     metrics |= task.evaluate(groups)
                 run.log(metrics, step=progress.trajectories)
+                watch(metrics)
                 progress.held = held(config.stop_when, progress.held, metrics)
             progress.is_annealing |= reached(config.anneal_from, metrics)
             temperatures.step(progress.is_annealing * (progress.trajectories - lifted_at))

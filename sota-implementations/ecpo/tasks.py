@@ -5,28 +5,28 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import (
+    CompositeDistribution,
     NormalParamExtractor,
     ProbabilisticTensorDictSequential,
     TensorDictModule,
     TensorDictSequential,
 )
 from torch import Tensor, nn
-from torch.distributions import Categorical
-from torchrl.data import Bounded
-from torchrl.data import Categorical as CategoricalSpec
+from torch.distributions import Categorical, Independent
+from torchrl.data import Bounded, MultiCategorical
 from torchrl.envs import (
     Compose,
     DoubleToFloat,
     EnvBase,
     ExplorationType,
-    GymEnv,
+    GymWrapper,
     SerialEnv,
     StepCounter,
     TransformedEnv,
@@ -40,8 +40,19 @@ from torchrl.modules import (
 )
 
 from torchrl_ecpo.collectors import TrajectoryGroupCollector
-from torchrl_ecpo.envs import AlgorithmicEnv, BanditEnv, EpisodeReplay, GroupedEnv
-from torchrl_ecpo.modules import SharedCategorical, make_softmax_policy, make_tuple_policy
+from torchrl_ecpo.envs import (
+    AlgorithmicEnv,
+    BanditEnv,
+    EpisodeReplay,
+    make_grouped_env,
+    readable,
+)
+from torchrl_ecpo.modules import (
+    PixelEncoder,
+    SharedCategorical,
+    make_softmax_policy,
+    make_tuple_policy,
+)
 
 EVALUATION_EPISODES = 100
 LONG_LEVEL = 30  # the last one
@@ -65,6 +76,8 @@ class Task:
     """Metrics on the progress bar and in the picture."""
     evaluation_env: nn.Module | None = None
     """Its state goes into checkpoints."""
+    least_entropy: float = 0.01
+    """In nats a step; with less, a policy does not explore."""
 
 
 def make_task(config: DictConfig) -> Task:
@@ -176,30 +189,52 @@ class Evaluation(nn.Module):
         }
 
 
-def make_gym(config: DictConfig) -> Task:
-    """A gymnasium task with discrete or continuous actions, with a feed-forward policy."""
+def make_raw_copy(name: str) -> gym.Env:
+    """A task of gymnasium, as it is."""
     try:
-        gym.spec(config.env.name)
+        return gym.make(name, disable_env_checker=True)
+    except (gym.error.DependencyNotInstalled, ModuleNotFoundError) as error:
+        raise ValueError(f"env.name={name} needs what is not installed: {error}") from error
     except gym.error.Error as error:
-        raise ValueError(f"env.name={config.env.name} is no task of gymnasium: {error}") from error
+        raise ValueError(
+            f"env.name={name} is no task of gymnasium: {error} If another module registers it, "
+            "name that too: env.name=module:Task-v0."
+        ) from error
 
-    def make_copy() -> EnvBase:
-        return GymEnv(config.env.name, categorical_action_encoding=True)
+
+def make_copy(name: str) -> gym.Env:
+    """A task of gymnasium, with spaces that the policy can read and play."""
+    try:
+        return readable(make_raw_copy(name))
+    except ValueError as error:
+        raise ValueError(f"env.name: {error}") from error
+
+
+def make_gym(config: DictConfig) -> Task:
+    """A gymnasium task of any readable spaces, with a feed-forward policy."""
+
+    def make_torchrl_copy() -> EnvBase:
+        return GymWrapper(make_copy(config.env.name), categorical_action_encoding=True)
 
     def make_evaluation_copy() -> EnvBase:
-        return TransformedEnv(make_copy(), EpisodeReplay())
+        return TransformedEnv(make_torchrl_copy(), EpisodeReplay())
 
     def limited(env: EnvBase) -> EnvBase:
         transforms: list[Any] = [DoubleToFloat(), StepCounter(config.env.max_steps)]
         return TransformedEnv(env, Compose(*transforms))
 
+    # By its id a task is played by its own vector entry point, if that can be.
+    raw = make_raw_copy(config.env.name)
+    source: Any = config.env.name if readable(raw) is raw else partial(make_copy, config.env.name)
+
     def make_env(num_groups: int) -> EnvBase:
-        return limited(GroupedEnv(make_copy, num_groups=num_groups, group_size=config.group_size))
+        sizes = {"num_groups": num_groups, "group_size": config.group_size}
+        return limited(make_grouped_env(source, **sizes))
 
     copies = SerialEnv(10, make_evaluation_copy)
     env, evaluation_env = make_env(config.num_groups), limited(copies)
     evaluation_env.set_seed(config.seed + 1_000_000)
-    actor = make_mlp_policy(env, config.env.hidden_sizes)
+    actor = make_feed_forward_policy(env, config.env.hidden_sizes)
 
     def measure(groups: TensorDictBase) -> Metrics:
         return {"length": groups["collector", "mask"].sum(-1).float().mean()}
@@ -208,33 +243,125 @@ def make_gym(config: DictConfig) -> Task:
         return {"greedy_return": _returns(greedy(evaluation_env, actor)).mean()}
 
     shown = ("return", "greedy_return", "entropy", "ESS")
-    return Task(env, make_env, actor, measure, evaluate, shown, copies)
+    return Task(env, make_env, actor, measure, evaluate, shown, copies, least_entropy(env))
 
 
-def make_mlp_policy(env: EnvBase, hidden_sizes: Sequence[int]) -> ProbabilisticTensorDictSequential:
-    """A multi-layer perceptron with a categorical or a tanh-Gaussian head, as the actions ask."""
-    spec: Any = env.action_spec
-    if not isinstance(env.action_spec, (CategoricalSpec, Bounded)):
-        raise ValueError(
-            f"env=gym takes tasks with one discrete action or bounded continuous ones, got {spec}."
-        )
-    size = env.observation_spec["observation"].shape[-1]
-    mlp = partial(MLP, in_features=size, num_cells=list(hidden_sizes), activation_class=nn.Tanh)
-    if spec.dtype == torch.int64:
-        network = TensorDictModule(mlp(out_features=spec.space.n), ["observation"], ["logits"])
-        return ProbabilisticActor(
-            network, in_keys=["logits"], distribution_class=Categorical, return_log_prob=True
-        )
-    parts: list[Any] = [
-        TensorDictModule(mlp(out_features=2 * spec.shape[-1]), ["observation"], ["parameters"]),
-        TensorDictModule(NormalParamExtractor(), ["parameters"], ["loc", "scale"]),
-    ]
+def least_entropy(env: EnvBase) -> float:
+    """0.01 nats for choices; for numbers, that of a uniform one within e^-5 of its range."""
+    least = 0.01
+    for spec in env.full_action_spec_unbatched.values(True, True):
+        if isinstance(spec, Bounded):
+            space: Any = spec.space
+            least += float(((space.high - space.low).log() - 5).sum())
+    return least
+
+
+class Choices(Independent):
+    """Several choices ``[*B, n]``, independent of each other, of ``nvec`` possibilities each."""
+
+    def __init__(self, logits: Tensor, nvec: Sequence[int]) -> None:
+        rows = [
+            nn.functional.pad(x, (0, max(nvec) - x.shape[-1]), value=-torch.inf)
+            for x in logits.split(list(nvec), -1)
+        ]
+        super().__init__(Categorical(logits=torch.stack(rows, -2)), 1)
+
+
+class Head(NamedTuple):
+    """How an action is drawn from the outputs of a network."""
+
+    size: int
+    """Number of these outputs."""
+    names: Sequence[str]
+    """Of the distribution's parameters."""
+    split: nn.Module
+    """From the outputs to the parameters."""
+    distribution: type
+    options: dict[str, Any]
+
+    @classmethod
+    def of(cls, spec: Any, one: tuple[int, ...]) -> Head:
+        """Categorical for a choice or several, tanh-Gaussian for bounded numbers."""
+        space = spec.space
+        if isinstance(spec, Bounded):
+            bounds = {"low": space.low[one], "high": space.high[one]}
+            size = 2 * spec.shape[-1]
+            return cls(size, ["loc", "scale"], NormalParamExtractor(), TanhNormal, bounds)
+        if spec.ndim == len(one):
+            return cls(space.n, ["logits"], Alone(), Categorical, {})
+        if isinstance(spec, MultiCategorical):
+            first: Any = spec[one]  # pyright: ignore[reportArgumentType] - it takes a tuple
+            nvec = first.nvec.tolist()
+        else:
+            nvec = [space.n] * spec.shape[-1]
+        return cls(sum(nvec), ["logits"], Alone(), Choices, {"nvec": nvec})
+
+
+class Split(nn.Module):
+    """The outputs of a network as the parameters of each head, one head after the other."""
+
+    def __init__(self, heads: Sequence[Head]) -> None:
+        super().__init__()
+        self.sizes = [head.size for head in heads]
+        self.splits = nn.ModuleList(head.split for head in heads)
+
+    def forward(self, outputs: Tensor) -> tuple[Tensor, ...]:
+        """From ``[..., n]``."""
+        of_heads = zip(self.splits, outputs.split(self.sizes, -1), strict=True)
+        return tuple(part for split, own in of_heads for part in split(own))
+
+
+class Alone(nn.Module):
+    """The outputs are the one parameter."""
+
+    def forward(self, outputs: Tensor) -> tuple[Tensor]:
+        """As they are."""
+        return (outputs,)
+
+
+def make_feed_forward_policy(
+    env: EnvBase, hidden_sizes: Sequence[int]
+) -> ProbabilisticTensorDictSequential:
+    """A multi-layer perceptron, behind convolutions where pixels are observed.
+
+    It has a head for the actions: categorical or tanh-Gaussian, or one of each.
+    """
     one = (0,) * env.ndim
+    specs: Any = env.full_action_spec.items(True, True)
+    heads: dict[Any, Head] = {key: Head.of(spec, one) for key, spec in specs}
+    shape = env.observation_spec["observation"].shape[env.ndim :]
+    encoder = PixelEncoder(shape) if len(shape) == 3 else None
+    network: nn.Module = MLP(
+        in_features=shape[-1] if encoder is None else encoder.size,
+        out_features=sum(head.size for head in heads.values()),
+        num_cells=list(hidden_sizes),
+        activation_class=nn.Tanh,
+    )
+    if encoder is not None:
+        network = nn.Sequential(encoder, network)
+    names: list[Any]
+    if list(heads) == ["action"]:
+        head = heads["action"]
+        names = in_keys = list(head.names)
+        distribution, options = head.distribution, head.options
+    else:
+        names = [("params", *key, name) for key, head in heads.items() for name in head.names]
+        in_keys, distribution = ["params"], CompositeDistribution
+        options = {
+            "distribution_map": {key: head.distribution for key, head in heads.items()},
+            "extra_kwargs": {key: head.options for key, head in heads.items()},
+        }
+
+    parts: list[Any] = [
+        TensorDictModule(network, ["observation"], ["parameters"]),
+        TensorDictModule(Split(list(heads.values())), ["parameters"], names),
+    ]
     return ProbabilisticActor(
         TensorDictSequential(*parts),
-        in_keys=["loc", "scale"],
-        distribution_class=TanhNormal,
-        distribution_kwargs={"low": spec.space.low[one], "high": spec.space.high[one]},
+        in_keys=in_keys,
+        out_keys=list(heads),
+        distribution_class=distribution,
+        distribution_kwargs=options,
         return_log_prob=True,
     )
 

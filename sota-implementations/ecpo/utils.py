@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Iterable, Sequence
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
+import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
-from tasks import Metrics, Task
+from tasks import Metrics, Task, make_copy
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
+from tqdm import tqdm
 
 import torchrl_ecpo
 from torchrl_ecpo import ECPOLoss, MENTLoss, PMDLoss, TrajectoryGroupLoss, UREXLoss
@@ -28,11 +31,15 @@ LOSSES = {  # whose files in config/loss/ are older than the entry class
 }
 TEMPERATURES = ("tau", "tau_prime", "kl_to_ref_coeff")
 COMPILABLE = ("bandit", "gym")
+LEAST_ESS = 1.5
+PATIENCE = 10  # batches running
 
 
 def check_config(config: DictConfig) -> None:
     """Refuse options that do not go together."""
     loss_class(config.loss)
+    if config.env.kind == "gym":
+        check_copies(config.env.name)
     if config.compile and not (config.seeds is None and config.stack is None):
         raise ValueError(
             "compile=true is for single runs. Leave out compile, or seeds and stack: --multirun "
@@ -49,6 +56,49 @@ def check_config(config: DictConfig) -> None:
             f"policy= is for the algorithmic tasks, got env.kind={config.env.kind!r}, which has a "
             "policy of its own. Leave out policy."
         )
+
+
+@cache
+def check_copies(name: str) -> None:
+    """Refuse a task of gymnasium that cannot be played, or no two copies of which start alike."""
+    first, second = (make_copy(name).reset(seed=0)[0] for _ in range(2))
+    if not np.array_equal(first, second, equal_nan=True):
+        raise ValueError(
+            f"env.name={name}: two copies of a problem instance differ at their start, though they "
+            "are reset with one seed. It has to draw its start from self.np_random, which "
+            "super().reset(seed=seed) seeds."
+        )
+
+
+class Watch:
+    """Says in one line, once, that the weights or the entropy of a run are gone.
+
+    Args:
+        group_size: K.
+        least_entropy: in nats a step.
+    """
+
+    def __init__(self, group_size: int, least_entropy: float) -> None:
+        self.least_entropy = least_entropy
+        self.batches = {"ESS": 0, "entropy": 0}
+        self.lines = {
+            "ESS": f"ESS stays below {LEAST_ESS} of {group_size}: an update rests on one "
+            "trajectory of a group. A higher loss.tau spreads the weights.",
+            "entropy": "The entropy is gone: the trajectories of a group hardly differ any more. "
+            "If the return is not what it could be, raise loss.tau_prime or lower optim.lr.",
+        }
+
+    def __call__(self, metrics: Metrics) -> None:
+        """Look at a batch."""
+        is_low = {
+            "ESS": metrics.get("ESS", LEAST_ESS) < LEAST_ESS,
+            "entropy": metrics["entropy"] / metrics.get("length", 1.0) < self.least_entropy,
+        }
+        for name, line in list(self.lines.items()):
+            self.batches[name] = self.batches[name] + 1 if is_low[name] else 0
+            if self.batches[name] == PATIENCE:
+                tqdm.write(line, file=sys.stderr)
+                del self.lines[name]
 
 
 def make_run(config: DictConfig, task: Task, **options: Any) -> Run:
@@ -77,7 +127,7 @@ def make_collector(config: DictConfig, task: Task) -> TrajectoryGroupCollector:
         num_groups=config.num_groups,
         group_size=config.group_size,
         # The loss computes them anew; they are most of a batch.
-        exclude_keys=["logits", "loc", "scale", "parameters"],
+        exclude_keys=["logits", "loc", "scale", "parameters", "params"],
         **options,
     )
     collector.set_seed(config.seed)
@@ -93,7 +143,12 @@ def make_loss(config: DictConfig, actor: ProbabilisticTensorDictSequential) -> T
     """The loss that ``loss=`` names; ``make_temperatures`` sets its temperatures."""
     apart = ("name", "class", *TEMPERATURES)
     options = {str(k): v for k, v in config.items() if k not in apart}
-    return loss_class(config)(actor, **options)
+    loss_module = loss_class(config)(actor, **options)
+    head: Any = actor[-1]
+    if len(head.dist_sample_keys) > 1:
+        names = {"action": head.dist_sample_keys, "sample_log_prob": head.log_prob_keys}
+        loss_module.set_keys(**names)
+    return loss_module
 
 
 def loss_class(config: DictConfig) -> type[TrajectoryGroupLoss]:

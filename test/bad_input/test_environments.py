@@ -13,6 +13,7 @@ from torchrl_ecpo.envs import (
     EpisodeReplay,
     GroupedEnv,
     GroupIdAllocator,
+    make_grouped_env,
 )
 
 OLD = "of a state written before states had an owner"
@@ -69,6 +70,24 @@ def grouped(entries):
 
 def play_grouped(entries):
     env = GroupedEnv(make_pendulum, num_groups=1, group_size=2)
+    env.set_seed(0)
+    return act(env, entries)
+
+
+def vectorised(entries):
+    env = make_grouped_env(**without(entries, "seed"))
+    env.set_seed(entries.get("seed", 0))
+    return env.reset()["observation"]
+
+
+def play_vectorised(entries):
+    env = make_grouped_env("Pendulum-v1", num_groups=1, group_size=2)
+    env.set_seed(0)
+    return act(env, entries)
+
+
+def play_cartpole(entries):
+    env = make_grouped_env("CartPole-v1", num_groups=1, group_size=2)
     env.set_seed(0)
     return act(env, entries)
 
@@ -195,6 +214,17 @@ SUBJECTS = {
     "GroupedEnv.step": Subject(
         play_grouped, {"action": torch.tensor([[[0.5], [-0.5]]])}, hands_on_nan=True
     ),
+    "make_grouped_env": Subject(
+        vectorised,
+        {"env": "Pendulum-v1", "num_groups": 1, "group_size": 2, "parallel": False, "seed": 1},
+        faults={"env": MAKERS},
+        optional=["parallel", "seed"],
+        fine={("seed", "0"): SEED},
+    ),
+    "make_grouped_env().step": Subject(
+        play_vectorised, {"action": torch.tensor([[[0.5], [-0.5]]])}, hands_on_nan=True
+    ),
+    "make_grouped_env().step, choices": Subject(play_cartpole, {"action": torch.tensor([[1, 0]])}),
     "GroupedEnv.load_state_dict": Subject(
         resume(make_group),
         {**make_group().get_extra_state(), "seed": 1},

@@ -26,15 +26,30 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_ecpo.envs import AlgorithmicEnv, EpisodeReplay, GroupedEnv, GroupIdAllocator
+from torchrl_ecpo.envs import (
+    AlgorithmicEnv,
+    EpisodeReplay,
+    GroupedEnv,
+    GroupIdAllocator,
+    make_grouped_env,
+)
 from torchrl_ecpo.groups import TrajectoryGroupSampler
 
 # A function of this module could not be imported by worker processes.
-cartpole = partial(GymEnv, "CartPole-v1")
+cartpole = partial(GymEnv, "CartPole-v1", categorical_action_encoding=True)
+CARTPOLES = {
+    "one by one": cartpole,
+    "SyncVectorEnv": partial(gymnasium.make, "CartPole-v1"),
+    "vector entry point": "CartPole-v1",
+}
+"""Ways to play one task in groups, which give the same numbers."""
+
+each_way = pytest.mark.parametrize("make", CARTPOLES.values(), ids=CARTPOLES)
 
 
 MAKERS = {
-    "CartPole-v1": (cartpole, "observation"),
+    **{f"CartPole-v1, {way}": (make, "observation") for way, make in CARTPOLES.items()},
+    "Pendulum-v1, SyncVectorEnv": ("Pendulum-v1", "observation"),
     "Pendulum-v1": (lambda: GymEnv("Pendulum-v1"), "observation"),
     "dm_control cartpole": (lambda: DMControlEnv("cartpole", "balance"), "position"),
     "torch": (PendulumEnv, "th"),
@@ -50,7 +65,7 @@ def headless(monkeypatch):
 @pytest.mark.parametrize("maker", MAKERS)
 def test_groups_of_any_environment(maker):
     make, key = MAKERS[maker]
-    env = GroupedEnv(make, num_groups=2, group_size=2)
+    env = make_grouped_env(make, num_groups=2, group_size=2)
     check_env_specs(env, seed=0)
     if maker != "transformed":
         transforms = [InitTracker(), RewardSum(), StepCounter(max_steps=4), DoubleToFloat()]
@@ -76,8 +91,9 @@ def test_groups_of_any_environment(maker):
     env.close()
 
 
-def test_nth_episodes_agree_though_copies_reset_at_different_times():
-    env = GroupedEnv(cartpole, num_groups=2, group_size=3)
+@each_way
+def test_nth_episodes_agree_though_copies_reset_at_different_times(make):
+    env = make_grouped_env(make, num_groups=2, group_size=3)
     rollout = env.rollout(120, break_when_any_done=False)
     first = torch.cat(
         [torch.ones(2, 3, 1, dtype=torch.bool), rollout["next", "done"][..., :-1, 0]], -1
@@ -101,8 +117,9 @@ def test_nth_episodes_agree_though_copies_reset_at_different_times():
     env.close()
 
 
-def test_seed_decides_the_instances():
-    env, other = (GroupedEnv(cartpole, num_groups=2, group_size=2) for _ in range(2))
+@each_way
+def test_seed_decides_the_instances(make):
+    env, other = (make_grouped_env(make, num_groups=2, group_size=2) for _ in range(2))
 
     def starts(env, seed):
         env.set_seed(seed)
@@ -118,9 +135,9 @@ def test_seed_decides_the_instances():
     other.close()
 
 
-@pytest.mark.parametrize("make", [cartpole, PendulumEnv])
+@pytest.mark.parametrize("make", [*CARTPOLES.values(), PendulumEnv])
 def test_reset_leaves_the_random_state_alone(make):
-    env = GroupedEnv(make, num_groups=2, group_size=2)
+    env = make_grouped_env(make, num_groups=2, group_size=2)
     env.reset()  # the copies are made here
     torch.manual_seed(0)
     expected = torch.rand(3)
@@ -131,8 +148,9 @@ def test_reset_leaves_the_random_state_alone(make):
     env.close()
 
 
-def test_partial_steps_and_resets_leave_the_others_where_they_are():
-    env = GroupedEnv(cartpole, num_groups=1, group_size=2)
+@each_way
+def test_partial_steps_and_resets_leave_the_others_where_they_are(make):
+    env = make_grouped_env(make, num_groups=1, group_size=2)
     start = env.reset()
     td = env.rand_action(start.clone())
     step = torch.tensor([[[True], [False]]])
@@ -144,15 +162,16 @@ def test_partial_steps_and_resets_leave_the_others_where_they_are():
     env.close()
 
 
-def test_parallel():
-    env = GroupedEnv(cartpole, num_groups=1, group_size=2, parallel=True)
-    serial = GroupedEnv(cartpole, num_groups=1, group_size=2)
+@pytest.mark.parametrize("make", [cartpole, "CartPole-v1"], ids=["ParallelEnv", "AsyncVectorEnv"])
+def test_parallel(make):
+    env = make_grouped_env(make, num_groups=1, group_size=2, parallel=True)
+    serial = make_grouped_env(make, num_groups=1, group_size=2)
     for e in (env, serial):
         e.set_seed(1)
     rollouts = [
         e.rollout(
             40,
-            policy=lambda td: td.set("action", torch.tensor([[[0, 1], [1, 0]]])),
+            policy=lambda td: td.set("action", torch.tensor([[1, 0]])),
             break_when_any_done=False,
         )
         for e in (env, serial)
@@ -163,8 +182,9 @@ def test_parallel():
     serial.close()
 
 
-def test_collector_and_sampler():
-    env = TransformedEnv(GroupedEnv(cartpole, num_groups=2, group_size=3), StepCounter())
+@each_way
+def test_collector_and_sampler(make):
+    env = TransformedEnv(make_grouped_env(make, num_groups=2, group_size=3), StepCounter())
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(1000),
         sampler=TrajectoryGroupSampler(group_size=3),
@@ -206,6 +226,22 @@ def test_bad_input(make, sizes, match):
         GroupedEnv(make, num_groups=sizes[0], group_size=sizes[1])
 
 
+@pytest.mark.parametrize(
+    ("make", "sizes", "match"),
+    [
+        ("CartPole-v1", (1, 1), r"group_size must be .* at least 2.*got 1"),
+        ("CartPole-v1", (0, 2), r"num_groups must be .* at least 1, got 0"),
+        ("CartPol-v1", (1, 2), "env='CartPol-v1' is no task of gymnasium: .*doesn't exist"),
+        (3, (1, 2), "env must be an id .* or a function that makes a copy, got 3"),
+        (GymEnv("CartPole-v1"), (1, 2), "env must be .* a function that makes a copy"),
+        (lambda: None, (1, 2), "What env makes must be a Env or EnvBase, got None"),
+    ],
+)
+def test_bad_input_of_the_front(make, sizes, match):
+    with pytest.raises((TypeError, ValueError), match=match):
+        make_grouped_env(make, num_groups=sizes[0], group_size=sizes[1])
+
+
 class SeveralActions(gymnasium.Env):
     observation_space = gymnasium.spaces.MultiDiscrete([4, 5])
     action_space = gymnasium.spaces.MultiDiscrete([2, 3])
@@ -231,9 +267,10 @@ def test_groups_over_several_discrete_actions(categorical, width):
     assert (played["observation"] == played["observation"][:, :1]).all()
 
 
+@each_way
 @pytest.mark.parametrize("seed", [-1, 1.5, "a"])
-def test_what_is_no_seed_is_refused(seed):
-    env = GroupedEnv(cartpole, num_groups=1, group_size=2)
+def test_what_is_no_seed_is_refused(make, seed):
+    env = make_grouped_env(make, num_groups=1, group_size=2)
     with pytest.raises(ValueError, match="seed must be an integer of at least 0, got"):
         env.set_seed(seed)
 
@@ -241,9 +278,12 @@ def test_what_is_no_seed_is_refused(seed):
 @pytest.mark.parametrize(
     ("make", "other"),
     [
-        (
-            lambda: GroupedEnv(cartpole, num_groups=2, group_size=2),
-            lambda: GroupedEnv(cartpole, num_groups=1, group_size=2),  # which would be broadcast
+        *(
+            (
+                partial(make_grouped_env, make, num_groups=2, group_size=2),
+                partial(make_grouped_env, make, num_groups=1, group_size=2),  # would be broadcast
+            )
+            for make in CARTPOLES.values()
         ),
         (
             lambda: GroupedEnv(cartpole, num_groups=1, group_size=2),
@@ -298,16 +338,18 @@ class Careless(gymnasium.Env):
         return numpy.random.rand(1), {}
 
 
-def test_copies_that_start_differently_are_refused():
-    env = GroupedEnv(lambda: GymWrapper(Careless()), num_groups=1, group_size=2)
+@pytest.mark.parametrize("make", [lambda: GymWrapper(Careless()), Careless])
+def test_copies_that_start_differently_are_refused(make):
+    env = make_grouped_env(make, num_groups=1, group_size=2)
     with pytest.raises(RuntimeError, match=r"differ in 'observation' at their start.*np_random"):
         env.reset()
     env.close()
 
 
-def test_episodes_that_are_over_are_forgotten():
+@each_way
+def test_episodes_that_are_over_are_forgotten(make):
     """Copies that are reset one by one, and never all together, keep no record of the past."""
-    env = GroupedEnv(cartpole, num_groups=1, group_size=2)
+    env = make_grouped_env(make, num_groups=1, group_size=2)
     start = env.reset()
 
     def episodes(number):
@@ -326,8 +368,9 @@ def test_episodes_that_are_over_are_forgotten():
     try:
         episodes(10)
         before = kept()
-        episodes(100)
-        assert kept() - before < 1000
+        episodes(500)
+        # Of two copies; some 3 kB come and go with torch's own objects.
+        assert (kept() - before) / (2 * 500) < 5, "bytes an episode"
     finally:
         tracemalloc.stop()
     env.close()

@@ -1,4 +1,4 @@
-"""Actors and critics for continuous actions."""
+"""Actors and critics."""
 
 from __future__ import annotations
 
@@ -7,14 +7,17 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.data import Bounded, OneHot
+from torchrl.data import Bounded, Categorical, MultiCategorical, OneHot
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import MLP
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_ecpo.modules import (
     DenseNetwork,
+    PixelEncoder,
     actor_critic,
+    make_action_value_network,
+    make_categorical_actor,
     make_deterministic_actor,
     make_qvalue_network,
     make_tanh_gaussian_actor,
@@ -273,3 +276,39 @@ def test_torchrl_s_sac_trains_them(deactivate_vmap):
 def test_other_actions_are_refused(make, spec, message):
     with pytest.raises(ValueError, match=message):
         make(3, spec)
+
+
+def test_an_encoder_scales_bytes_and_keeps_any_batch():
+    encoder = PixelEncoder((2, 20, 7))
+    bytes_ = torch.randint(256, (4, 3, 2, 20, 7), dtype=torch.uint8)
+    features = encoder(bytes_)
+    assert features.shape == (4, 3, encoder.size)
+    assert encoder.size == 2 * 1 * 32  # 20 becomes 10, 5, 3, 2 and 7 becomes 4, 2, 1, 1
+    expected = encoder.convolutions(bytes_[1, 2].float() / 255)
+    torch.testing.assert_close(features[1, 2], expected)
+
+
+@pytest.mark.parametrize("observation_size", [3, (1, 9, 9)])
+def test_networks_of_vectors_and_of_pixels_write_the_same_entries(observation_size):
+    """And no others, which would go into the replay buffer."""
+    pixels = torch.zeros(5, 1, 9, 9, dtype=torch.uint8)
+    observation = torch.zeros(5, 3) if observation_size == 3 else pixels
+    batch = TensorDict(observation=observation, batch_size=[5])
+    discrete = make_categorical_actor(observation_size, Categorical(4))(batch.clone())
+    assert {*discrete.keys()} == {"observation", "logits", "action"}
+    assert discrete["action"].shape == (5,)
+    actor = make_tanh_gaussian_actor(observation_size, SPEC)(batch.clone())
+    assert {*actor.keys()} == {"observation", "loc", "scale", "action"}
+    deterministic = make_deterministic_actor(observation_size, SPEC)(batch.clone())
+    assert {*deterministic.keys()} == {"observation", "pre_tanh", "action"}
+    values = make_action_value_network(observation_size, 4)(batch.clone())
+    assert values["action_value"].shape == (5, 4)
+    assert "features" not in values
+    qvalue = make_qvalue_network(observation_size, 2)(actor)
+    assert qvalue["state_action_value"].shape == (5, 1)
+
+
+@pytest.mark.parametrize("spec", [Categorical(3, shape=(2,)), MultiCategorical([2, 3]), SPEC])
+def test_a_categorical_actor_takes_one_discrete_action(spec):
+    with pytest.raises(ValueError, match="action_spec must be of one discrete action"):
+        make_categorical_actor(3, spec)

@@ -1,10 +1,17 @@
 """The paper's problems as batched TorchRL environments, and groups over any environment."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from torchrl_ecpo.envs._groups import GroupIdAllocator
 from torchrl_ecpo.envs.algorithmic import TASKS, AlgorithmicEnv, AlgorithmicTask
 from torchrl_ecpo.envs.bandit import BanditEnv
 from torchrl_ecpo.envs.grouped import GroupedEnv
 from torchrl_ecpo.envs.replay import EpisodeReplay
+
+if TYPE_CHECKING:
+    from torchrl_ecpo.envs.plain_spaces import readable
+    from torchrl_ecpo.envs.vector import VectorGroupedEnv, make_grouped_env
 
 __all__ = [
     "TASKS",
@@ -14,4 +21,20 @@ __all__ = [
     "EpisodeReplay",
     "GroupIdAllocator",
     "GroupedEnv",
+    "VectorGroupedEnv",
+    "make_grouped_env",
+    "readable",
 ]
+
+OF_GYMNASIUM = {
+    "VectorGroupedEnv": "vector",
+    "make_grouped_env": "vector",
+    "readable": "plain_spaces",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """What needs gymnasium is imported where it is first asked for: the rest does without."""
+    if name in OF_GYMNASIUM:
+        return getattr(import_module(f"{__name__}.{OF_GYMNASIUM[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

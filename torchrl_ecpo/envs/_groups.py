@@ -1,4 +1,4 @@
-"""Group ids, one integer for each problem instance; and which environment a state is of."""
+"""Group ids, one integer for each problem instance; copies seeded by group; whose a state is."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDictBase
+from torchrl.data import Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_ecpo.checks import check_count, check_kind
+from torchrl_ecpo.groups import GROUP_KEY
 
 _COUNTER_BITS = 24
 _PREFIX_BITS = 63 - _COUNTER_BITS
@@ -101,3 +104,99 @@ def check_owner(state: Mapping[str, Any], own: str) -> None:
     owner = state.get("env", own)
     if owner != own:
         raise ValueError(f"The state is of another environment: of {owner}, and this is {own}.")
+
+
+class SeededGroups(EnvBase):
+    """Rows of copies `[G, K]`; the `n`-th episode of each copy of a row has one seed and one id.
+
+    Who extends this sets the specs, calls :meth:`_begin`, and writes :meth:`_start` and ``_step``.
+    """
+
+    def _begin(self) -> None:
+        """Add the group to the specs, and draw a seed."""
+        rows = self.batch_size
+        spec: Any = self.full_observation_spec
+        spec[GROUP_KEY] = Unbounded(shape=rows, dtype=torch.int64, device=self.device)
+        self.full_observation_spec = spec
+        self._group = torch.zeros(rows, dtype=torch.int64, device=self.device)
+        self._set_seed(None)
+
+    def _start(
+        self, tensordict: TensorDictBase | None, seeds: list[int | None], **kwargs: Any
+    ) -> TensorDictBase:
+        """Reset the copies that have a seed, and return what all of them show, and their groups.
+
+        Args:
+            tensordict: what `reset` was given if some of the copies go on. None: all have a seed.
+            seeds: of each copy `[G * K]`; None: it goes on.
+            kwargs: what else `reset` was given.
+        """
+        raise NotImplementedError
+
+    def _add_group(self, out: TensorDictBase) -> TensorDictBase:
+        """Write what is played."""
+        return out.set(GROUP_KEY, self._group.clone())
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            seed = check_count("seed", seed, least=0)
+        self._seed = secrets.randbits(63) if seed is None else seed
+        self._ids = GroupIdAllocator()  # an instance of another seed is another one
+        self._episode = np.zeros(self.batch_size, dtype=int)  # of each copy, the next one
+
+    def _next_instances(self, selected: np.ndarray) -> tuple[list[int | None], np.ndarray]:
+        """Return the seeds and the group ids of the next episodes of copies `[G, K]`."""
+        seeds: list[int | None] = [None] * selected.size
+        ids = np.zeros(selected.shape, dtype=int)
+        known: dict[tuple[int, int], tuple[int, int]] = {}
+        for row, copy in np.argwhere(selected).tolist():
+            key = row, int(self._episode[row, copy])
+            if key not in known:
+                sequence = np.random.SeedSequence(self._seed, spawn_key=key)
+                known[key] = int(sequence.generate_state(1)[0]), self._ids.identify(*key)
+            seeds[row * selected.shape[1] + copy], ids[row, copy] = known[key]
+        self._episode += selected
+        return seeds, ids
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
+            tensordict = None
+            # The copies of a row may have played different numbers of episodes.
+            self._episode[:] = self._episode.max(1, keepdims=True)
+            selected = np.ones(self.batch_size, dtype=bool)
+        else:
+            selected = mask.reshape(*self.batch_size, -1).any(-1).numpy(force=True)
+        seeds, ids = self._next_instances(selected)
+        group = torch.from_numpy(np.where(selected, ids, self._group.numpy(force=True)))
+        self._group = group.to(self._group.device)
+        out = self._start(tensordict, seeds, **kwargs)
+        if mask is None:
+            self._check_alike(out)
+        return out
+
+    def _check_alike(self, start: TensorDictBase) -> None:
+        for key in self.full_observation_spec.keys(True, True):
+            value = start.get(key, None)
+            if not isinstance(value, torch.Tensor):
+                continue
+            first = value[:, :1]
+            if not ((value == first) | ((value != value) & (first != first))).all():
+                raise RuntimeError(
+                    f"The copies of a group differ in {key!r} at their start, though they are "
+                    "reset with one seed. The environment has to draw its start from a generator "
+                    "that its reset seeds, gymnasium's self.np_random, or from torch's."
+                )
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """The seed and what was played of it; an episode that is being played is not in it."""
+        return {"env": describe(self), "seed": self._seed, "episode": self._episode.tolist()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Go on with the next instances; the environment must be reset."""
+        check_owner(state, describe(self))
+        seed, episode = check_count("seed", state["seed"], least=0), np.asarray(state["episode"])
+        if episode.shape != self._episode.shape or episode.dtype.kind != "i":
+            raise ValueError(f"episode must be integers {list(self.batch_size)}, got {episode}.")
+        self._set_seed(seed)
+        self._episode[:] = episode

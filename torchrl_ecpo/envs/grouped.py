@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 from tensordict import TensorDictBase
-from torchrl.data import Unbounded
 from torchrl.data.utils import CloudpickleWrapper
 from torchrl.envs import EnvBase, GymWrapper, ParallelEnv, SerialEnv, TransformedEnv
 
 from torchrl_ecpo.checks import check_count, check_flag, check_group_size, check_real, get_entry
-from torchrl_ecpo.envs._groups import GroupIdAllocator, check_owner, describe
-from torchrl_ecpo.groups import GROUP_KEY
+from torchrl_ecpo.envs._groups import SeededGroups
 
 __all__ = ["GroupedEnv"]
 
 
-class GroupedEnv(EnvBase):
+class GroupedEnv(SeededGroups):
     """`G` rows of `K` copies of an environment; the copies of a row start from the same state.
 
     The batch size is `[num_groups, group_size]`, `[G, K]`. Each row plays one problem instance
     after the other: the `n`-th episode of each of its copies is started from the seed of (row, `n`)
     and carries the same integer ``"group"``, whether the copies are reset together or each at its
     own time. A reset of everything starts a new instance in every row.
+
+    Copies of gymnasium's are played several times as fast by
+    :func:`~torchrl_ecpo.envs.make_grouped_env`.
 
     Wrap it in the transforms that count or sum (``StepCounter(max_steps=...)``, ``RewardSum()``,
     ``InitTracker()``, ``DoubleToFloat()``) like any other environment.
@@ -98,84 +97,30 @@ class GroupedEnv(EnvBase):
         # Not a submodule: the state of the copies is not the state_dict's business.
         object.__setattr__(self, "copies", copies)
         self._copy_specs()
-        self._group = torch.zeros(self.batch_size, dtype=torch.int64, device=self.device)
-        self._set_seed(None)
+        self._begin()
 
     def _copy_specs(self) -> None:
-        rows = self.batch_size
         for name in ("observation", "action", "state", "reward", "done"):
             # The copies are alike, and some specs cannot be unflattened.
-            spec = getattr(self.copies, f"full_{name}_spec")[0].expand(rows)
-            if name == "observation":
-                spec[GROUP_KEY] = Unbounded(shape=rows, dtype=torch.int64, device=self.device)
+            spec = getattr(self.copies, f"full_{name}_spec")[0].expand(self.batch_size)
             setattr(self, f"full_{name}_spec", spec)
 
-    def _set_seed(self, seed: int | None) -> None:
-        if seed is not None:
-            seed = check_count("seed", seed, least=0)
-        self._seed = secrets.randbits(63) if seed is None else seed
-        self._ids = GroupIdAllocator()  # an instance of another seed is another one
-        self._episode = np.zeros(self.batch_size, dtype=int)  # of each copy, the next one
-
-    def _next_instance(self, row: int, copy: int) -> tuple[int, int]:
-        """Return the seed and the group id of the next episode of a copy."""
-        key = row, int(self._episode[row, copy])
-        self._episode[row, copy] += 1
-        seed = np.random.SeedSequence(self._seed, spawn_key=key).generate_state(1)[0]
-        return int(seed), self._ids.identify(*key)
-
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        if mask is None:
-            # The copies of a row may have played different numbers of episodes.
-            self._episode[:] = self._episode.max(1, keepdims=True)
-            selected = torch.ones(self.batch_size, dtype=torch.bool)
-        else:
-            selected = mask.reshape(*self.batch_size, -1).any(-1).cpu()
-        options = [dict(kwargs) for _ in range(selected.numel())]
-        group = self._group.clone()
-        for row, copy in selected.nonzero().tolist():
-            seed, group[row, copy] = self._next_instance(row, copy)
-            options[row * self.batch_size[1] + copy]["seed"] = seed
-        self._group = group
-        flat = None if tensordict is None or mask is None else tensordict.reshape(-1)
+    def _start(
+        self,
+        tensordict: TensorDictBase | None,
+        seeds: list[int | None],
+        **kwargs: Any,
+    ) -> TensorDictBase:
+        options = [kwargs if seed is None else {**kwargs, "seed": seed} for seed in seeds]
+        flat = None if tensordict is None else tensordict.reshape(-1)
         out = self.copies.reset(flat, list_of_kwargs=options)
-        out = out.reshape(self.batch_size)
-        if mask is None:
-            self._check_alike(out)
-        return out.set(GROUP_KEY, group.clone())
-
-    def _check_alike(self, start: TensorDictBase) -> None:
-        for key in self.full_observation_spec.keys(True, True):
-            value = start.get(key, None)
-            if not isinstance(value, torch.Tensor):
-                continue
-            first = value[:, :1]
-            if not ((value == first) | ((value != value) & (first != first))).all():
-                raise RuntimeError(
-                    f"The copies of a group differ in {key!r} at their start, though they are "
-                    "reset with one seed. The environment has to draw its start from a generator "
-                    "that its reset seeds, gymnasium's self.np_random, or from torch's."
-                )
+        return self._add_group(out.reshape(self.batch_size))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         for key in self.action_keys:
             check_real(key, get_entry(tensordict, key))
         out = self.copies.step(tensordict.reshape(-1))["next"]
-        return out.reshape(self.batch_size).set(GROUP_KEY, self._group.clone())
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """The seed and what was played of it; an episode that is being played is not in it."""
-        return {"env": describe(self), "seed": self._seed, "episode": self._episode.tolist()}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Go on with the next instances; the environment must be reset."""
-        check_owner(state, describe(self))
-        seed, episode = check_count("seed", state["seed"], least=0), np.asarray(state["episode"])
-        if episode.shape != self._episode.shape or episode.dtype.kind != "i":
-            raise ValueError(f"episode must be integers {list(self.batch_size)}, got {episode}.")
-        self._set_seed(seed)
-        self._episode[:] = episode
+        return self._add_group(out.reshape(self.batch_size))
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close the copies."""

@@ -47,7 +47,7 @@ class EpisodeReplay(Transform):
     def __init__(self) -> None:
         super().__init__()
         self._start: str | None = None
-        self._actions: list[Tensor] = []
+        self._actions: list[Tensor | dict[str, Any]] = []
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._start, self._actions = self._random_state(), []
@@ -59,7 +59,9 @@ class EpisodeReplay(Transform):
         return tensordict_reset
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self._actions.append(tensordict["action"].clone())
+        action = tensordict["action"]
+        parts = isinstance(action, TensorDictBase)
+        self._actions.append(action.to_dict() if parts else action.clone())
         return next_tensordict
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -78,7 +80,7 @@ class EpisodeReplay(Transform):
         is_begun = check_flag("is_begun", state["is_begun"])
         check_kind("actions", state["actions"], list)
         for action in state["actions"]:
-            check_kind("Each of actions", action, Tensor)
+            check_kind("Each of actions", action, Tensor, dict)
         try:
             self._set_random_state(state["start"])
         except (ValueError, TypeError, KeyError, AttributeError) as error:

@@ -2,12 +2,15 @@
 
 from torchrl_ecpo.modules.actor_critic import (
     DenseNetwork,
+    make_action_value_network,
+    make_categorical_actor,
     make_deterministic_actor,
     make_qvalue_network,
     make_tanh_gaussian_actor,
     make_value_network,
 )
 from torchrl_ecpo.modules.latents import record_latents
+from torchrl_ecpo.modules.pixels import PixelEncoder
 from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
 from torchrl_ecpo.modules.softmax import LinearSoftmax, SharedCategorical, make_softmax_policy
 from torchrl_ecpo.modules.tuple_policy import TupleCategorical, TupleTables, make_tuple_policy
@@ -19,9 +22,12 @@ __all__ = [
     "DistinctWindowNetwork",
     "LinearSoftmax",
     "OneHotLinear",
+    "PixelEncoder",
     "SharedCategorical",
     "TupleCategorical",
     "TupleTables",
+    "make_action_value_network",
+    "make_categorical_actor",
     "make_deterministic_actor",
     "make_qvalue_network",
     "make_softmax_policy",

@@ -1,8 +1,9 @@
-"""Feed-forward actors and critics for continuous actions.
+"""Feed-forward actors and critics, for continuous actions and for one discrete one.
 
 All networks are multi-layer perceptrons with ReLU; by default two layers of 256 units, the usual
-size for SAC and TD3 on the MuJoCo tasks. They read ``observation``; an actor writes ``action``
-within the bounds of its specification.
+size for SAC and TD3 on the MuJoCo tasks. They read ``observation``, a vector, or pixels through a
+:class:`~torchrl_ecpo.modules.PixelEncoder` of their own; an actor writes ``action`` within the
+bounds of its specification.
 """
 
 from __future__ import annotations
@@ -15,13 +16,16 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
+    TensorDictModule,
     TensorDictModuleBase,
     TensorDictSequential,
     dispatch,
 )
 from torch import Tensor, nn
+from torch.distributions import Categorical
 from torch.nn.functional import linear
 from torchrl.data import Bounded, TensorSpec
+from torchrl.data import Categorical as CategoricalSpec
 from torchrl.modules import ProbabilisticActor, TanhModule, TanhNormal
 
 from torchrl_ecpo._torch import is_transformed
@@ -33,9 +37,12 @@ from torchrl_ecpo.checks import (
     check_kind,
     names_entries,
 )
+from torchrl_ecpo.modules.pixels import PixelEncoder
 
 __all__ = [
     "DenseNetwork",
+    "make_action_value_network",
+    "make_categorical_actor",
     "make_deterministic_actor",
     "make_qvalue_network",
     "make_tanh_gaussian_actor",
@@ -212,7 +219,7 @@ def _loc_and_scale(output: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def make_tanh_gaussian_actor(
-    observation_size: int,
+    observation_size: int | Sequence[int],
     action_spec: TensorSpec,
     *,
     hidden_sizes: Sequence[int] = HIDDEN_SIZES,
@@ -221,7 +228,7 @@ def make_tanh_gaussian_actor(
     """A stochastic policy: a Gaussian, squashed by tanh into the bounds of the actions.
 
     Args:
-        observation_size: length of an observation vector.
+        observation_size: length of an observation vector, or ``(C, H, W)`` of pixels.
         action_spec: of one environment, bounded, ``[A]``.
         hidden_sizes: units of each hidden layer. Default: (256, 256).
         final_gain: factor of the last layer's parameters at the start. Default: 1. With 0.01 the
@@ -244,11 +251,12 @@ def make_tanh_gaussian_actor(
         (torch.Size([5, 1]), True)
     """
     spec = _bounded(action_spec)
-    network: Any = DenseNetwork(
-        ["observation"],
+    network = _network(
+        observation_size,
         ["loc", "scale"],
-        _sizes(observation_size, hidden_sizes, 2 * spec.shape[-1]),
-        _loc_and_scale,
+        hidden_sizes,
+        2 * spec.shape[-1],
+        head=_loc_and_scale,
         final_gain=final_gain,
     )
     return ProbabilisticActor(
@@ -261,7 +269,7 @@ def make_tanh_gaussian_actor(
 
 
 def make_deterministic_actor(
-    observation_size: int,
+    observation_size: int | Sequence[int],
     action_spec: TensorSpec,
     *,
     hidden_sizes: Sequence[int] = HIDDEN_SIZES,
@@ -269,7 +277,7 @@ def make_deterministic_actor(
     """A deterministic policy, for TD3 and DDPG: tanh, scaled to the bounds of the actions.
 
     Args:
-        observation_size: length of an observation vector.
+        observation_size: length of an observation vector, or ``(C, H, W)`` of pixels.
         action_spec: of one environment, bounded, ``[A]``.
         hidden_sizes: units of each hidden layer. Default: (256, 256).
 
@@ -285,19 +293,21 @@ def make_deterministic_actor(
         torch.Size([5, 1])
     """
     spec = _bounded(action_spec)
-    sizes = _sizes(observation_size, hidden_sizes, spec.shape[-1])
-    network: Any = DenseNetwork(["observation"], ["pre_tanh"], sizes)
+    network = _network(observation_size, ["pre_tanh"], hidden_sizes, spec.shape[-1])
     squash: Any = TanhModule(in_keys=["pre_tanh"], out_keys=["action"], spec=spec)
     return TensorDictSequential(network, squash)
 
 
 def make_qvalue_network(
-    observation_size: int, action_size: int, *, hidden_sizes: Sequence[int] = HIDDEN_SIZES
-) -> DenseNetwork:
+    observation_size: int | Sequence[int],
+    action_size: int,
+    *,
+    hidden_sizes: Sequence[int] = HIDDEN_SIZES,
+) -> TensorDictModuleBase:
     """Q(s, a): reads ``observation`` and ``action``, writes ``state_action_value`` ``[..., 1]``.
 
     Args:
-        observation_size: length of an observation vector.
+        observation_size: length of an observation vector, or ``(C, H, W)`` of pixels.
         action_size: length A of an action vector.
         hidden_sizes: units of each hidden layer. Default: (256, 256).
 
@@ -307,18 +317,17 @@ def make_qvalue_network(
         >>> qvalue(observation=torch.zeros(5, 3), action=torch.zeros(5, 2)).shape
         torch.Size([5, 1])
     """
-    sizes = _sizes(observation_size, hidden_sizes, 1)
-    sizes[0] += check_count("action_size", action_size)
-    return DenseNetwork(["observation", "action"], ["state_action_value"], sizes)
+    size = check_count("action_size", action_size)
+    return _network(observation_size, ["state_action_value"], hidden_sizes, 1, action_size=size)
 
 
 def make_value_network(
-    observation_size: int, *, hidden_sizes: Sequence[int] = HIDDEN_SIZES
-) -> DenseNetwork:
+    observation_size: int | Sequence[int], *, hidden_sizes: Sequence[int] = HIDDEN_SIZES
+) -> TensorDictModuleBase:
     """V(s): reads ``observation``, writes ``state_value`` ``[..., 1]``.
 
     Args:
-        observation_size: length of an observation vector.
+        observation_size: length of an observation vector, or ``(C, H, W)`` of pixels.
         hidden_sizes: units of each hidden layer. Default: (256, 256).
 
     Examples:
@@ -326,13 +335,97 @@ def make_value_network(
         >>> make_value_network(3)(observation=torch.zeros(5, 3)).shape
         torch.Size([5, 1])
     """
-    sizes = _sizes(observation_size, hidden_sizes, 1)
-    return DenseNetwork(["observation"], ["state_value"], sizes)
+    return _network(observation_size, ["state_value"], hidden_sizes, 1)
 
 
-def _sizes(observation_size: int, hidden_sizes: Sequence[int], num_outputs: int) -> list[int]:
-    size = check_count("observation_size", observation_size)
-    return [size, *check_counts("hidden_sizes", hidden_sizes), num_outputs]
+def make_categorical_actor(
+    observation_size: int | Sequence[int],
+    action_spec: TensorSpec,
+    *,
+    hidden_sizes: Sequence[int] = HIDDEN_SIZES,
+) -> ProbabilisticTensorDictSequential:
+    """A policy over one of n actions, for the discrete losses.
+
+    Args:
+        observation_size: length of an observation vector, or ``(C, H, W)`` of pixels.
+        action_spec: of one environment: ``Categorical``, an integer.
+        hidden_sizes: units of each hidden layer. Default: (256, 256).
+
+    Raises:
+        ValueError: if an action is not one integer.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.data import Categorical
+        >>> actor = make_categorical_actor(3, Categorical(4))
+        >>> actor(TensorDict({"observation": torch.zeros(5, 3)}, batch_size=[5]))["action"].shape
+        torch.Size([5])
+    """
+    spec = action_spec
+    if not isinstance(spec, CategoricalSpec) or spec.ndim:
+        raise ValueError(
+            "action_spec must be of one discrete action (torchrl's Categorical, of shape ()), got "
+            f"{type(spec).__name__} of shape {tuple(spec.shape)}. Several actions belong to the "
+            "losses of groups, such as ECPOLoss."
+        )
+    return ProbabilisticActor(
+        _network(observation_size, ["logits"], hidden_sizes, spec.n),
+        in_keys=["logits"],
+        spec=spec,
+        distribution_class=Categorical,
+    )
+
+
+def make_action_value_network(
+    observation_size: int | Sequence[int],
+    num_actions: int,
+    *,
+    hidden_sizes: Sequence[int] = HIDDEN_SIZES,
+) -> TensorDictModuleBase:
+    """Q(s, .): reads ``observation``, writes ``action_value`` ``[..., n]``, of each of n actions.
+
+    Args:
+        observation_size: length of an observation vector, or ``(C, H, W)`` of pixels.
+        num_actions: n.
+        hidden_sizes: units of each hidden layer. Default: (256, 256).
+
+    Examples:
+        >>> import torch
+        >>> make_action_value_network(3, 4)(observation=torch.zeros(5, 3)).shape
+        torch.Size([5, 4])
+    """
+    size = check_count("num_actions", num_actions)
+    return _network(observation_size, ["action_value"], hidden_sizes, size)
+
+
+def _network(
+    observation_size: int | Sequence[int],
+    out_keys: Sequence[str],
+    hidden_sizes: Sequence[int],
+    num_outputs: int,
+    *,
+    action_size: int = 0,
+    **options: Any,
+) -> Any:
+    """A multi-layer perceptron; of pixels, behind convolutions."""
+    hidden = check_counts("hidden_sizes", hidden_sizes)
+    action = ["action"] if action_size else []
+    if not isinstance(observation_size, Sequence) or isinstance(observation_size, str):
+        sizes = [check_count("observation_size", observation_size) + action_size, *hidden]
+        sizes.append(num_outputs)
+        return DenseNetwork(["observation", *action], out_keys, sizes, **options)
+    if len(observation_size) != 3:
+        raise ValueError(
+            "observation_size must be an integer of at least 1, or (channels, height, width) of "
+            f"pixels, got {observation_size!r}."
+        )
+    encoder = PixelEncoder(observation_size)
+    sizes = [encoder.size + action_size, *hidden, num_outputs]
+    parts: list[Any] = [
+        TensorDictModule(encoder, ["observation"], ["features"]),
+        DenseNetwork(["features", *action], out_keys, sizes, **options),
+    ]
+    return TensorDictSequential(*parts, selected_out_keys=list(out_keys))
 
 
 def _bounded(action_spec: TensorSpec) -> Any:

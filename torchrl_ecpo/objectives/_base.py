@@ -74,12 +74,18 @@ class PolicyLoss(LossModule):
         self.reduction = "mean" if reduction is None else reduction
         check_choice("reduction", self.reduction, REDUCTIONS)
         self.delay_actor = check_flag("delay_actor", delay_actor)
-        self.convert_to_functional(actor_network, "actor_network", create_target_params=delay_actor)
+        self._take(actor_network)
         self._allow_zero = allow_zero
         for name, value in self._as_temperatures(temperatures or {}).items():
             self.register_coeff_buffer(name, value, device=self._device)
         self.temperature_names = tuple(temperatures or ())
         self.register_load_state_dict_pre_hook(_check_loaded)
+
+    def _take(self, actor_network: Any) -> None:
+        """Hold the actor, and its delayed copy."""
+        self.convert_to_functional(
+            actor_network, "actor_network", create_target_params=self.delay_actor
+        )
 
     @property
     def _device(self) -> torch.device | None:

@@ -208,6 +208,7 @@ class DiscreteECACLoss(ECACLoss):
         tau_prime: float = 0.1,
         target_kl: float | None = 0.1,
         target_entropy: float | Literal["auto"] | None = None,
+        projection: Literal["paper"] = "paper",
         **options: Any,
     ) -> None:
         super().__init__(
@@ -217,6 +218,6 @@ class DiscreteECACLoss(ECACLoss):
             tau_prime=tau_prime,
             target_kl=target_kl,
             target_entropy=target_entropy,
-            projection="paper",
+            projection=projection,
             **options,
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
@@ -102,16 +102,29 @@ class MPOLoss(ActorCriticLoss):
         epsilon_mean: float = 0.01,
         epsilon_scale: float = 0.001,
         tau: float = 1.0,
+        tau_prime: float = 0.0,
+        target_kl: None = None,
+        target_entropy: float | Literal["auto"] | None = None,
+        num_action_samples: int = 20,
+        num_next_action_samples: int = 20,
+        delay_actor: bool = True,
         **options: Any,
     ) -> None:
-        if options.get("target_kl") is not None:
-            raise ValueError(
-                f"MPO's lift has the bound epsilon; got target_kl={options['target_kl']}."
-            )
-        settings: dict[str, Any] = {"tau_prime": 0.0, "target_entropy": None, "delay_actor": True}
-        settings |= {"num_action_samples": 20, "num_next_action_samples": 20, "target_kl": None}
-        networks = (actor_network, qvalue_network, value_network)
-        super().__init__(*networks, tau=tau, **(settings | options))
+        if target_kl is not None:
+            raise ValueError(f"MPO's lift has the bound epsilon; got target_kl={target_kl}.")
+        super().__init__(
+            actor_network,
+            qvalue_network,
+            value_network,
+            tau=tau,
+            tau_prime=tau_prime,
+            target_kl=None,
+            target_entropy=target_entropy,
+            num_action_samples=num_action_samples,
+            num_next_action_samples=num_next_action_samples,
+            delay_actor=delay_actor,
+            **options,
+        )
         bounds = {"epsilon": epsilon, "epsilon_mean": epsilon_mean, "epsilon_scale": epsilon_scale}
         self.bounds = {name: as_float(name, bound) for name, bound in bounds.items()}
         for name, bound in self.bounds.items():

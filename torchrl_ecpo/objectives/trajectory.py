@@ -42,6 +42,7 @@ from torchrl_ecpo.functional import (
     uniform_weights,
 )
 from torchrl_ecpo.groups import DONE_KEY, GROUP_KEY
+from torchrl_ecpo.llm.completions import check_actor, is_language_model, read_completions
 from torchrl_ecpo.modules.distinct import take_rows
 from torchrl_ecpo.modules.latents import (
     invert,
@@ -138,7 +139,10 @@ class TrajectoryGroupLoss(PolicyLoss):
         actor_network: a policy with ``get_dist``: feed-forward or recurrent (it is called in
             recurrent mode on ``[N, T]``), with any action distribution whose log-probability has
             the shape of the batch, also a composite one (the parts are added up), or several
-            distributions, each of which may read what those before it have drawn.
+            distributions, each of which may read what those before it have drawn. Or a wrapper of a
+            language model, ``TransformersWrapper(..., generate=False)``: then the batch is one of
+            completions, ``[B]`` or ``[*G, K]``, as TorchRL's own ``GRPOLoss`` takes it
+            (:mod:`torchrl_ecpo.llm`), and the T steps are their tokens.
 
     Keyword Args:
         temperatures: initial values by name; each becomes a buffer that is scheduled by assignment
@@ -204,11 +208,14 @@ class TrajectoryGroupLoss(PolicyLoss):
             sample_log_prob: log-probability of the action under the policy that drew it,
                 ``[*G, K, T]``; a list of keys is added up. Defaults to ``"action_log_prob"``, or
                 to ``"sample_log_prob"`` if ``composite_lp_aggregate()`` is True, as in TorchRL.
+            prompt: of completions ``[B]`` of a language model, what those of one group have in
+                common: texts, integers or tokens. Defaults to ``"query"``, as in TorchRL.
         """
 
         action: NestedKey | list[NestedKey] = "action"
         reward: NestedKey = "reward"
         sample_log_prob: NestedKey | list[NestedKey] | None = None
+        prompt: NestedKey = "query"
 
         def __post_init__(self) -> None:
             if self.sample_log_prob is None:
@@ -238,8 +245,27 @@ class TrajectoryGroupLoss(PolicyLoss):
         )
         check_choice("score", score, tuple(SCORES))
         self.score = score
+        if self._reads_completions:
+            actor: Any = actor_network
+            self.set_keys(
+                action=(actor.tokens_key, "full"), sample_log_prob=(actor.log_probs_key, "full")
+            )
         self._check_names()
-        self._may_squash = any(map(may_squash, self._heads))
+        self._may_squash = not self._reads_completions and any(map(may_squash, self._heads))
+
+    def _take(self, actor_network: Any) -> None:
+        """A language model stays a part of the loss, as it is: one too large for a second copy."""
+        self._reads_completions = is_language_model(actor_network)
+        if not self._reads_completions:
+            super()._take(actor_network)
+            return
+        check_actor(actor_network)
+        if self.delay_actor:
+            raise ValueError(
+                "delay_actor=True would keep a second copy of the language model. Leave it out: "
+                "the reference policy is the one that the log-probabilities were recorded of."
+            )
+        self.actor_network = actor_network
 
     # ------------------------------------------------------------------------------- one method
 
@@ -282,13 +308,19 @@ class TrajectoryGroupLoss(PolicyLoss):
 
     @property
     def _all_in_keys(self) -> list[NestedKey]:
+        actor: Any = self.actor_network
+        mask_keys = self.mask_keys[:1]
+        if self._reads_completions:
+            mask_keys = () if self.loss_mask_key == "auto" else mask_keys  # prompts tell
+            mask_keys += ((actor.tokens_key, "prompt"), (actor.masks_key, "all_attention_mask"))
+            mask_keys += (self.tensor_keys.prompt,)
         return [
-            *self.actor_network.in_keys,
+            *actor.in_keys,
             *self.further_in_keys,
             *_as_list(self.tensor_keys.action),
             self._reward_key,
             *_as_list(self.tensor_keys.sample_log_prob),
-            *self.mask_keys[:1],
+            *mask_keys,
             *self._latent_keys,
         ]
 
@@ -334,14 +366,38 @@ class TrajectoryGroupLoss(PolicyLoss):
         scores = SCORES[self.score](returns, mask=mask)
         return TrajectoryGroups(returns, log_prob, reference, behaviour, mask, steps, scores)
 
+    def _read_completions(self, tensordict: TensorDictBase) -> Steps:
+        keys: Any = self.tensor_keys
+        found = read_completions(
+            self.actor_network,
+            tensordict,
+            tokens_key=keys.action,
+            log_prob_key=keys.sample_log_prob,
+            reward_key=self._reward_key,
+            prompt_key=keys.prompt,
+            mask_key=self.loss_mask_key,
+        )
+        if found.recorded is None:
+            raise KeyError(
+                f"The entry {keys.sample_log_prob!r} is missing: the log-probability of each token "
+                "under the policy that drew it. Let the sampler record it, or compute it with "
+                "torchrl_ecpo.llm.record_log_probs(actor, batch), before the first update."
+            )
+        if values_can_be_seen():
+            self._check_left(self.loss_mask_key, found.mask)
+        return Steps(found.rewards, found.log_prob, found.recorded, found.recorded, found.mask)
+
     def _read_steps(self, tensordict: TensorDictBase) -> Steps:
+        if self._reads_completions:
+            return self._read_completions(tensordict)
         reward = get_entry(tensordict, self._reward_key)
         shape = _batch_shape(reward, self._reward_key)
         mask = self._mask(tensordict, shape)
         if values_can_be_seen():
             real_steps = torch.ones(shape, dtype=torch.bool, device=reward.device)
             if mask is not None:
-                self._check_mask(mask)
+                check_padding(self.mask_keys, mask)
+                self._check_left(self.mask_keys, mask)
                 real_steps = mask
             if self._lacks_time(tensordict, real_steps):
                 steps = tensordict.copy()
@@ -546,13 +602,12 @@ class TrajectoryGroupLoss(PolicyLoss):
             "instance."
         )
 
-    def _check_mask(self, mask: Tensor) -> None:
-        """Refuse holes, and groups of which too little is left."""
-        check_padding(self.mask_keys, mask)
+    def _check_left(self, name: Any, mask: Tensor) -> None:
+        """Refuse groups of which a mask leaves too little."""
         is_small = mask.any(-1).sum(-1) < 2
         if is_small.any():
             raise ValueError(
-                f"The mask ({self.mask_keys}) leaves {int(is_small.sum())} group(s) "
+                f"The mask ({name}) leaves {int(is_small.sum())} group(s) "
                 "with fewer than two trajectories that have a real step: weights are relative to "
                 "the other trajectories of the group. Drop such groups before calling the loss."
             )

@@ -19,6 +19,7 @@ from torchrl_ecpo.checks import (
     unreadable,
 )
 from torchrl_ecpo.functional import Surrogate, masked_mean, path_consistency
+from torchrl_ecpo.llm.completions import is_language_model
 from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, Steps, TrajectoryGroups
 
 __all__ = ["TrustPCLLoss"]
@@ -118,6 +119,11 @@ class TrustPCLLoss(LiftProjectLoss):
         delay_actor: bool = True,
         reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
+        if is_language_model(actor_network):
+            raise TypeError(
+                "TrustPCLLoss reads values of states, which completions of a language model have "
+                "not. Take another loss over groups, such as ECPOLoss."
+            )
         super().__init__(
             actor_network,
             tau=tau,

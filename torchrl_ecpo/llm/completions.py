@@ -1,0 +1,393 @@
+"""Completions of a language model, as TorchRL's wrappers write them, read as trajectories.
+
+Shapes: `B` completions in rows, or groups `[*G, K]` of them; `L` tokens of the longest prompt and
+completion together. Shorter ones are padded on the left, as the wrappers do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torch.nn.functional import cross_entropy
+
+from torchrl_ecpo.checks import (
+    check_group_size,
+    check_mask,
+    check_real,
+    present,
+    values_can_be_seen,
+)
+
+__all__ = ["check_sampler", "record_log_probs"]
+
+# What leaves the policy's own distribution as it is, by name of the sampler's setting.
+NEUTRAL: Mapping[str, tuple[float | None, ...]] = {
+    "temperature": (None, 1),
+    "top_k": (None, 0, -1),
+    "top_p": (None, 1),
+    "min_p": (None, 0),
+    "repetition_penalty": (None, 1),
+}
+
+
+class Completions(NamedTuple):
+    """Groups of completions: numbers are ``[*G, K, L]``, 0 where the mask is False."""
+
+    rewards: Tensor
+    """The return of a completion, at its last token."""
+    log_prob: Tensor
+    """log pi_theta of each token of a completion; carries the gradient."""
+    recorded: Tensor | None
+    """The recorded log-probabilities, if there are any."""
+    mask: Tensor
+    """True where the token is the policy's own."""
+
+
+def is_language_model(actor: Any) -> bool:
+    """Whether an actor has the interface of TorchRL's ``LLMWrapperBase``."""
+    return all(hasattr(actor, name) for name in ("tokens_key", "masks_key", "log_probs_key"))
+
+
+def check_actor(actor: Any) -> None:
+    """Refuse a wrapper whose log-probabilities cannot be those of the completions."""
+    if actor.generate:
+        raise ValueError(
+            "The actor generates (generate=True), so it has no get_dist. Build a second wrapper of "
+            "the same model, with generate=False."
+        )
+    if "prompt" in actor.in_keys[0]:
+        raise ValueError(
+            f"The actor reads {actor.in_keys[0]!r}, a prompt without its completion. Leave out "
+            "input_key, or name the 'full' entry (get_new_version(generate=False) keeps the "
+            "sampler's key)."
+        )
+    tokenizer = getattr(actor, "tokenizer", None)
+    padding = getattr(tokenizer, "pad_token_id", None)
+    if padding is None or padding == getattr(tokenizer, "eos_token_id", None):
+        raise ValueError(
+            "The actor's tokenizer has no padding token of its own (the wrapper then takes the "
+            "end-of-sequence token, and the end of a completion would count for nothing). Set "
+            "tokenizer.pad_token to a token that is never sampled."
+        )
+    _check_settings(_settings(actor))
+
+
+def check_sampler(sampler: Any) -> None:
+    """Refuse a generating wrapper that does not sample from its model's own distribution.
+
+    ``TransformersWrapper`` records log-probabilities of the unchanged model, whatever it samples
+    from: nothing in a batch tells that they are not the sampler's.
+
+    Args:
+        sampler: a ``TransformersWrapper`` or ``vLLMWrapper`` with ``generate=True``.
+
+    Raises:
+        ValueError: for greedy decoding (the default of transformers), a temperature other than 1,
+            top-k (by default, transformers draws from the 50 likeliest tokens), top-p, min-p or a
+            repetition penalty, be it the wrapper's or of the model's ``generation_config``.
+
+    Examples:
+        >>> from types import SimpleNamespace
+        >>> sampler = SimpleNamespace(generate_kwargs={"temperature": 0.7})  # as of a wrapper
+        >>> check_sampler(sampler)  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ValueError: The sampler has temperature=0.7, so that it draws from another distribution ...
+    """
+    config = getattr(getattr(sampler, "model", None), "generation_config", None)
+    settings = _settings(sampler)
+    if config is not None:
+        of_model = {name: getattr(config, name, None) for name in ("do_sample", *NEUTRAL)}
+        settings = of_model | {name: x for name, x in settings.items() if x is not None}
+        if settings["top_k"] is None:
+            settings["top_k"] = 50
+        if not settings["do_sample"]:
+            raise ValueError(
+                "The sampler decodes greedily: all completions of a prompt would be the same. Add "
+                "do_sample=True to its generate_kwargs."
+            )
+        if settings["top_k"] >= sampler.model.config.vocab_size:
+            settings["top_k"] = 0
+    _check_settings(settings)
+
+
+def _settings(wrapper: Any) -> dict[str, Any]:
+    """How a wrapper was told to sample, with vLLM's own defaults."""
+    given = getattr(wrapper, "generate_kwargs", None) or {}
+    parameters = getattr(wrapper, "sampling_params", None)
+    names = ("do_sample", *NEUTRAL)
+    return {name: given.get(name, getattr(parameters, name, None)) for name in names}
+
+
+def _check_settings(settings: Mapping[str, Any]) -> None:
+    """Refuse settings under which a model is not sampled from its own distribution."""
+    for name, neutral in NEUTRAL.items():
+        if settings[name] not in neutral:
+            raise ValueError(
+                f"The sampler has {name}={settings[name]}, so that it draws from another "
+                "distribution than the model's own, which the loss takes the policy to be. Sample "
+                "with temperature=1 and top_p=1, and without top_k (transformers: "
+                "model.generation_config.top_k = 0)."
+            )
+
+
+@torch.no_grad()
+def record_log_probs(actor: Any, tensordict: TensorDictBase) -> TensorDictBase:
+    """Write the log-probability of every token under an actor, in single precision.
+
+    For samplers that do not record them, or not exactly: ``TransformersWrapper`` writes those of
+    the response only, 0 for its first token, in the model's own precision. Call it with the weights
+    that sampled, before the first update.
+
+    Args:
+        actor: a wrapper with ``generate=False``.
+        tensordict: completions ``[B]`` or ``[*G, K]`` with ``("tokens", "full")``.
+
+    Returns:
+        The same tensordict, with ``("log_probs", "full")``, ``[L]`` in each row; 0 for the first
+        token, which has no probability, and for padding.
+
+    Raises:
+        ValueError: if dropout is on, or a padding token stands between others.
+
+    Examples:
+        A wrapper by its interface alone, of which each of 3 tokens has probability 1/3:
+
+        >>> from types import SimpleNamespace
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules.distributions import LLMMaskedCategorical
+        >>> mask = torch.ones(2, 3, dtype=torch.bool)
+        >>> actor = torch.nn.Module()
+        >>> actor.tokens_key, actor.masks_key, actor.log_probs_key = "tokens", "masks", "log_probs"
+        >>> actor.generate, actor.in_keys = False, [("tokens", "full")]
+        >>> actor.tokenizer = SimpleNamespace(pad_token_id=0, eos_token_id=1)
+        >>> actor.get_dist = lambda *_, **__: LLMMaskedCategorical(torch.zeros(2, 3, 3), mask)
+        >>> tokens = torch.tensor([[2, 2, 1], [2, 1, 2]])
+        >>> batch = TensorDict({"tokens": {"full": tokens}}, [2])
+        >>> record_log_probs(actor, batch)["log_probs", "full"][0]
+        tensor([ 0.0000, -1.0986, -1.0986])
+    """
+    check_actor(actor)
+    _check_dropout(actor)
+    rows = tensordict.reshape(-1)
+    logits, attention = _logits(actor, rows)
+    tokens = _padded(rows, (actor.tokens_key, "full"), 0)
+    log_prob = _log_prob(logits, tokens, _with_context(attention, attention))
+    key = (actor.log_probs_key, "full")
+    lengths = [len(row) for row in _entries(rows, (actor.tokens_key, "full"))]
+    if min(lengths) == max(lengths):
+        return tensordict.set(key, log_prob.reshape(*tensordict.shape, -1))
+    for row, length, values in zip(rows.unbind(0), lengths, log_prob, strict=True):
+        row.set(key, values[len(values) - length :])
+    return tensordict
+
+
+def read_completions(
+    actor: Any,
+    tensordict: TensorDictBase,
+    *,
+    tokens_key: NestedKey,
+    log_prob_key: NestedKey,
+    reward_key: NestedKey,
+    prompt_key: NestedKey,
+    mask_key: NestedKey | None,
+) -> Completions:
+    """Read completions as groups.
+
+    Args:
+        actor: a wrapper with ``generate=False``.
+        tensordict: completions ``[B]``, groups of which `prompt_key` tells, or groups ``[*G, K]``.
+        tokens_key: prompt and completion.
+        log_prob_key: their recorded log-probabilities, if there are any.
+        reward_key: of a completion, or of its tokens, which are added up.
+        prompt_key: text, integer or tokens, equal within a group only.
+        mask_key: which tokens are the policy's own. ``"auto"``: those after the prompt; None: all.
+    """
+    _check_dropout(actor)
+    rows, members = tensordict.reshape(-1), _members(tensordict, prompt_key)
+    returns = _padded(rows, reward_key, 0.0)
+    check_real(reward_key, returns)
+    returns = returns.reshape(len(returns), -1).sum(-1)
+    logits, attention = _logits(actor, rows)
+    tokens = _padded(rows, tokens_key, 0)
+    if tokens.shape != attention.shape:
+        raise ValueError(
+            f"The actor evaluates {attention.shape[-1]} tokens, but {tokens_key!r} has "
+            f"{tokens.shape[-1]}: a text was divided into other tokens than those that were "
+            "sampled. Build the actor with input_mode='tokens'."
+        )
+    if mask_key == "auto":
+        mask = attention & _after_prompt(rows, tokens, tokens_key, (actor.tokens_key, "prompt"))
+    elif mask_key is None:
+        mask = attention
+    else:
+        mask = attention & check_mask(mask_key, _padded(rows, mask_key, False), attention.shape)
+    mask = _with_context(mask, attention)
+    log_prob = _log_prob(logits, tokens, mask)
+    recorded = None
+    if _entries(rows, log_prob_key) is not None:
+        recorded = _recorded(_padded(rows, log_prob_key, 0.0), log_prob_key, log_prob, mask)
+        recorded = recorded[members]
+    last = mask & (mask.flip(-1).cumsum(-1).flip(-1) == 1)
+    rewards = returns.to(log_prob.dtype).unsqueeze(-1).where(last, 0.0)
+    return Completions(rewards[members], log_prob[members], recorded, mask[members])
+
+
+# ------------------------------------------------------------------------------------- small parts
+
+
+def _members(tensordict: TensorDictBase, prompt_key: NestedKey) -> Tensor:
+    """The rows of each group ``[*G, K]``, as numbers among all rows."""
+    prompts = _entries(tensordict.reshape(-1), prompt_key)
+    if prompts is not None:
+        prompts = prompts.tolist() if hasattr(prompts, "tolist") else prompts
+        prompts = [_hashable(prompt) for prompt in prompts]
+    if tensordict.ndim > 1:
+        members = torch.arange(tensordict.numel()).view(tensordict.shape)
+    elif prompts is None:
+        raise KeyError(
+            f"The entry {prompt_key!r} is missing, which tells the groups of a batch "
+            f"{list(tensordict.shape)} apart; there are {present(tensordict)}. Name another with "
+            "set_keys(prompt=...), such as ('tokens', 'prompt'), or give the K completions of each "
+            "group in a row: batch.reshape(-1, K)."
+        )
+    else:
+        rows: dict[Any, list[int]] = {}
+        for number, prompt in enumerate(prompts):
+            rows.setdefault(prompt, []).append(number)
+        sizes = sorted({len(group) for group in rows.values()})
+        if len(sizes) > 1:
+            raise ValueError(
+                f"Groups of unequal size: {prompt_key!r} tells of {len(rows)} groups, of {sizes} "
+                "completions. Draw whole ones, such as with TorchRL's PromptGroupSampler."
+            )
+        members = torch.tensor(list(rows.values()))
+    check_group_size(members.shape[-1], f"K of the batch {list(tensordict.shape)}")
+    groups = members.flatten(0, -2).tolist()
+    mixed = prompts is not None and sum(len({prompts[i] for i in group}) > 1 for group in groups)
+    if mixed:
+        raise ValueError(f"{mixed} groups [*G, K] hold several prompts ({prompt_key!r}).")
+    return members
+
+
+def _hashable(entry: Any) -> Any:
+    """A text, number or row of tokens, so that equal ones are found."""
+    entry = entry.tolist() if isinstance(entry, Tensor) else entry
+    return tuple(entry) if isinstance(entry, list) else entry
+
+
+def _padded(rows: Any, key: NestedKey, fill: float) -> Tensor:
+    """An entry ``[B, L, ...]``; rows of unequal length are padded on the left."""
+    value = rows.get(key, None, as_padded_tensor=True, padding_side="left", padding_value=fill)
+    if value is None:
+        raise KeyError(f"The entry {key!r} is missing; there are {present(rows)}.")
+    return value
+
+
+def _entries(rows: Any, key: NestedKey) -> Any:
+    """An entry row by row, each with the padding that it has itself; None if it is missing."""
+    return rows.get(key, None, as_list=True)
+
+
+def _logits(actor: Any, rows: TensorDictBase) -> tuple[Tensor, Tensor]:
+    """Logits ``[B, L, V]`` of each token given those before it, and which tokens are real."""
+    attention_key = (actor.masks_key, "all_attention_mask")
+    distribution = actor.get_dist(rows, mask_key=attention_key, padding_side="left")
+    attention = distribution.mask.bool()
+    if values_can_be_seen():
+        begins = (attention[:, 1:] & ~attention[:, :-1]).sum(-1) + attention[:, 0]
+        if (begins > 1).any():
+            raise ValueError(
+                f"{int((begins > 1).sum())} completions have padding between their tokens "
+                f"({attention_key!r}): the sampler drew a padding token before the end. Drop "
+                "them, or keep the sampler from it, with suppress_tokens for example."
+            )
+    return distribution.logits, attention
+
+
+def _after_prompt(
+    rows: TensorDictBase, tokens: Tensor, tokens_key: NestedKey, prompt_key: NestedKey
+) -> Tensor:
+    """Which tokens ``[B, L]`` come after the prompt."""
+    if _entries(rows, prompt_key) is None:
+        raise KeyError(
+            f"The entry {prompt_key!r} is missing, after which a completion begins; there are "
+            f"{present(rows)}. Or name a mask of the policy's own tokens: "
+            "loss_module.loss_mask_key = ('masks', 'all_assistant_mask')."
+        )
+    prompt, length = _padded(rows, prompt_key, 0), tokens.shape[-1]
+    of_prompt, of_all = (
+        torch.tensor([len(row) for row in _entries(rows, key)], device=tokens.device).unsqueeze(-1)
+        for key in (prompt_key, tokens_key)
+    )
+    begin = length - of_all + of_prompt
+    if values_can_be_seen():
+        distance = torch.arange(prompt.shape[-1], 0, -1, device=tokens.device)
+        beside = tokens.gather(-1, (begin - distance).clamp(0, length - 1))
+        differs = ((beside != prompt) & (distance <= of_prompt)).any(-1)
+        if differs.any():
+            raise ValueError(
+                f"In {int(differs.sum())} rows {tokens_key!r} does not begin with {prompt_key!r}, "
+                "padding included: where does the completion begin? Name a mask of the policy's "
+                "own tokens with loss_module.loss_mask_key."
+            )
+    return torch.arange(length, device=tokens.device) >= begin
+
+
+def _with_context(mask: Tensor, attention: Tensor) -> Tensor:
+    """Without the first real token of a row: nothing stands before it that it could follow."""
+    return torch.cat([torch.zeros_like(mask[:, :1]), mask[:, 1:] & attention[:, :-1]], -1)
+
+
+def _log_prob(logits: Tensor, tokens: Tensor, mask: Tensor) -> Tensor:
+    """Log-probabilities ``[B, L]``, 0 elsewhere, of the tokens where the mask is True.
+
+    In single precision at least. Only their logits are taken: prompts and padding cost nothing.
+    """
+    own = logits[mask]
+    own = own.to(torch.promote_types(own.dtype, torch.float32))
+    log_prob = -cross_entropy(own, tokens[mask], reduction="none")
+    return log_prob.new_zeros(mask.shape).masked_scatter(mask, log_prob)
+
+
+def _recorded(recorded: Tensor, key: NestedKey, log_prob: Tensor, mask: Tensor) -> Tensor:
+    """Recorded log-probabilities ``[B, L]``, 0 where the mask is False."""
+    check_real(key, recorded)
+    anew = "Compute them anew with torchrl_ecpo.llm.record_log_probs(actor, batch), before the "
+    anew += "first update."
+    if recorded.shape != mask.shape:
+        raise ValueError(
+            f"The log-probabilities {key!r} must have the shape {tuple(mask.shape)} of the tokens, "
+            f"got {tuple(recorded.shape)}. {anew}"
+        )
+    if torch.finfo(recorded.dtype).bits < 32:
+        raise ValueError(
+            f"The log-probabilities {key!r} are of {recorded.dtype}: summed over a completion, "
+            f"they are off by nats. {anew}"
+        )
+    recorded = recorded.detach().where(mask, 0.0).to(log_prob.dtype)
+    first = mask & (mask.cumsum(-1) == 1)
+    if values_can_be_seen() and (first & (recorded == 0) & (log_prob < -0.1)).any():
+        raise ValueError(
+            f"The log-probabilities {key!r} are 0 for the first token of completions, where the "
+            f"actor's are not: TransformersWrapper records no other. {anew}"
+        )
+    return recorded
+
+
+def _check_dropout(actor: Any) -> None:
+    """Refuse dropout: the policy that sampled had other units than the one that is evaluated."""
+    for name, module in actor.named_modules():
+        rate = (
+            module.p if isinstance(module, nn.Dropout) else getattr(module, "attention_dropout", 0)
+        )
+        if module.training and isinstance(rate, float) and rate > 0:
+            raise ValueError(
+                f"The actor's {name!r} drops out {rate:.0%} of its units, so that its "
+                "log-probabilities are not those of the policy that sampled. Call model.eval(), "
+                "or build the model without dropout."
+            )
