@@ -15,7 +15,8 @@ from torchrl.data import Bounded
 from torchrl_ecpo.modules import make_tanh_gaussian_actor
 
 ROOT = Path(__file__).parents[1]
-TEXT = (ROOT / "sota-implementations/results/claims.yaml").read_text()
+RESULTS = ROOT / "sota-implementations/results"
+TEXT = (RESULTS / "claims.yaml").read_text()
 CLAIMS = yaml.load(TEXT, yaml.BaseLoader)
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 QUOTING = [page for page in PAGES if "<!-- claim: " in page.read_text()]
@@ -92,3 +93,8 @@ def test_what_a_humanoid_observes_drives_an_untrained_policy_to_the_ends_of_its_
         actor = make_tanh_gaussian_actor(348, actions, final_gain=gain)
         mean_before_tanh = actor.get_dist(states).base_dist.base_dist.loc
         assert lowest < mean_before_tanh.abs().max() < highest
+
+
+@pytest.mark.parametrize("trace", sorted((RESULTS / "play").iterdir()), ids=lambda path: path.stem)
+def test_traces_of_play_stand_on_the_page_as_they_are_committed(trace):
+    assert f"```text\n{trace.read_text()}```" in (ROOT / "docs/results.md").read_text()

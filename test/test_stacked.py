@@ -272,6 +272,7 @@ def test_what_is_no_list_of_runs_is_refused(script, name, given):
         (["stack=['env=copy','env=reverse']"], "must agree in env.name, got copy and reverse"),
         (["stack=['seed=0','group_size=5']"], "must agree in group_size, got 100 and 5. They may"),
         (["stack=['seed=0','project_steps=3']"], "have 100 and 300 trajectories: .* end together"),
+        (["loss=trust_pcl", "seeds=[0,1]"], r"a value network, such as loss=trust_pcl"),
         (["env=gym", "seeds=[0,1]"], r"got env\.kind='gym'.*--multirun"),
         (["collector=multi_sync", "seeds=[0,1]"], r"collector=single, got .*'process'"),
         (["env=copy", "stack=['policy=lstm','seed=1']"], "must agree in policy.name, got lstm and"),

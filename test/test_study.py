@@ -711,7 +711,6 @@ STATED = re.compile(r"(-?[\d,.]+) ± ([\d,.]+)(?: \((.+)\))?")
     [
         ("docs/results.md", ("first_bandit", "first_tasks"), r"task \| trajectories"),
         ("docs/results.md", ("figure2",), r"task[^|]*(?:\| runs )?\| ECAC"),
-        ("README.md", ("figure2",), r"task[^|]*(?:\| runs )?\| ECAC"),
     ],
 )
 def test_the_tables_of_results_state_what_is_committed(study, page, names, heading):

@@ -44,7 +44,7 @@ def main(config: DictConfig) -> None:
     torch.manual_seed(config.seed)
     task = make_task(config)
     collector = make_collector(config, task)
-    loss_module = make_loss(config.loss, task.actor)
+    loss_module = make_loss(config.loss, task.actor, task.make_value_network)
     if config.compile:
         compile_module(loss_module, "loss")
     optimizer = make_optimizer(config.optim, loss_module.parameters())

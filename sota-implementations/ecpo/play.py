@@ -37,7 +37,9 @@ def load_run(directory: Path) -> tuple[DictConfig, Task]:
     config: Any = OmegaConf.load(directory / "config.yaml")
     if (directory / "checkpoints").is_dir():
         task = make_task(config)
-        restore_part(directory, "loss_module", make_loss(config.loss, task.actor))
+        restore_part(
+            directory, "loss_module", make_loss(config.loss, task.actor, task.make_value_network)
+        )
         return config, task
     tasks = [make_task(config) for _ in directory.parent.glob("*/config.yaml")]
     states = [torch.get_rng_state()] * len(tasks)

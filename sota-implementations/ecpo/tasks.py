@@ -36,6 +36,7 @@ from torchrl.modules import (
     MLP,
     ProbabilisticActor,
     TanhNormal,
+    ValueOperator,
     get_env_transforms_from_module,
 )
 
@@ -76,6 +77,8 @@ class Task:
     """Metrics on the progress bar and in the picture."""
     evaluation_env: nn.Module | None = None
     """Its state goes into checkpoints."""
+    make_value_network: Callable[[], TensorDictModule] | None = None
+    """For a loss that has one: reads what the policy reads, writes ``"state_value"``."""
     least_entropy: float = 0.01
     """In nats a step; with less, a policy does not explore."""
 
@@ -107,7 +110,9 @@ def make_bandit(config: DictConfig) -> Task:
         return {"expected_reward": env.expected_reward(distribution.probs)}
 
     shown = ("expected_reward", "entropy", "ESS")
-    return Task(env, make_env, actor, measure, lambda groups: {}, shown)
+    task = Task(env, make_env, actor, measure, lambda groups: {}, shown)
+    task.make_value_network = lambda: ValueOperator(nn.Linear(1, 1))
+    return task
 
 
 def make_algorithmic(config: DictConfig) -> Task:
@@ -139,8 +144,14 @@ def make_algorithmic(config: DictConfig) -> Task:
     def evaluate(groups: TensorDictBase) -> Metrics:
         return evaluation.measure(round(groups["level"][..., 0].float().mean().item()))
 
+    def make_value_network() -> TensorDictModule:
+        size = config.policy.hidden_size
+        return ValueOperator(
+            nn.Sequential(nn.Embedding(env.task.base + 1, size), nn.ReLU(), nn.Linear(size, 1))
+        )
+
     shown = ("return", "level", "attained", "entropy", "ESS")
-    return Task(env, make_env, actor, measure, evaluate, shown, evaluation)
+    return Task(env, make_env, actor, measure, evaluate, shown, evaluation, make_value_network)
 
 
 class Evaluation(nn.Module):
@@ -243,7 +254,17 @@ def make_gym(config: DictConfig) -> Task:
         return {"greedy_return": _returns(greedy(evaluation_env, actor)).mean()}
 
     shown = ("return", "greedy_return", "entropy", "ESS")
-    return Task(env, make_env, actor, measure, evaluate, shown, copies, least_entropy(env))
+    return Task(
+        env,
+        make_env,
+        actor,
+        measure,
+        evaluate,
+        shown,
+        copies,
+        lambda: ValueOperator(feed_forward(env, 1, config.env.hidden_sizes)),
+        least_entropy(env),
+    )
 
 
 def least_entropy(env: EnvBase) -> float:
@@ -319,26 +340,27 @@ class Alone(nn.Module):
         return (outputs,)
 
 
-def make_feed_forward_policy(
-    env: EnvBase, hidden_sizes: Sequence[int]
-) -> ProbabilisticTensorDictSequential:
-    """A multi-layer perceptron, behind convolutions where pixels are observed.
-
-    It has a head for the actions: categorical or tanh-Gaussian, or one of each.
-    """
-    one = (0,) * env.ndim
-    specs: Any = env.full_action_spec.items(True, True)
-    heads: dict[Any, Head] = {key: Head.of(spec, one) for key, spec in specs}
+def feed_forward(env: EnvBase, out_features: int, hidden_sizes: Sequence[int]) -> nn.Module:
+    """A multi-layer perceptron on the observation, behind convolutions where it is an image."""
     shape = env.observation_spec["observation"].shape[env.ndim :]
     encoder = PixelEncoder(shape) if len(shape) == 3 else None
-    network: nn.Module = MLP(
+    network = MLP(
         in_features=shape[-1] if encoder is None else encoder.size,
-        out_features=sum(head.size for head in heads.values()),
+        out_features=out_features,
         num_cells=list(hidden_sizes),
         activation_class=nn.Tanh,
     )
-    if encoder is not None:
-        network = nn.Sequential(encoder, network)
+    return network if encoder is None else nn.Sequential(encoder, network)
+
+
+def make_feed_forward_policy(
+    env: EnvBase, hidden_sizes: Sequence[int]
+) -> ProbabilisticTensorDictSequential:
+    """A network with a head for the actions: categorical or tanh-Gaussian, or one of each."""
+    one = (0,) * env.ndim
+    specs: Any = env.full_action_spec.items(True, True)
+    heads: dict[Any, Head] = {key: Head.of(spec, one) for key, spec in specs}
+    network = feed_forward(env, sum(head.size for head in heads.values()), hidden_sizes)
     names: list[Any]
     if list(heads) == ["action"]:
         head = heads["action"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
 from typing import Any
 
@@ -13,11 +13,22 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from tasks import Metrics, Task, make_copy
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+)
 from tqdm import tqdm
 
 import torchrl_ecpo
-from torchrl_ecpo import ECPOLoss, MENTLoss, PMDLoss, TrajectoryGroupLoss, UREXLoss
+from torchrl_ecpo import (
+    ECPOLoss,
+    MENTLoss,
+    PMDLoss,
+    TrajectoryGroupLoss,
+    TrustPCLLoss,
+    UREXLoss,
+)
 from torchrl_ecpo.collectors import TrajectoryGroupCollector
 from torchrl_ecpo.experiment import Run
 from torchrl_ecpo.schedules import TemperatureScheduler, make_schedule
@@ -139,16 +150,28 @@ def is_single(config: DictConfig) -> bool:
     return config.collector.backend == "direct"
 
 
-def make_loss(config: DictConfig, actor: ProbabilisticTensorDictSequential) -> TrajectoryGroupLoss:
+def make_loss(
+    config: DictConfig,
+    actor: TensorDictModuleBase,
+    make_value_network: Callable[[], TensorDictModule] | None = None,
+) -> TrajectoryGroupLoss:
     """The loss that ``loss=`` names; ``make_temperatures`` sets its temperatures."""
     apart = ("name", "class", *TEMPERATURES)
     options = {str(k): v for k, v in config.items() if k not in apart}
+    if has_value_network(config):
+        assert make_value_network is not None
+        options["value_network"] = make_value_network()
     loss_module = loss_class(config)(actor, **options)
-    head: Any = actor[-1]
-    if len(head.dist_sample_keys) > 1:
+    head: Any = actor[-1] if isinstance(actor, ProbabilisticTensorDictSequential) else None
+    if head is not None and len(head.dist_sample_keys) > 1:
         names = {"action": head.dist_sample_keys, "sample_log_prob": head.log_prob_keys}
         loss_module.set_keys(**names)
     return loss_module
+
+
+def has_value_network(config: DictConfig) -> bool:
+    """Whether a loss learns values too."""
+    return issubclass(loss_class(config), TrustPCLLoss)
 
 
 def loss_class(config: DictConfig) -> type[TrajectoryGroupLoss]:

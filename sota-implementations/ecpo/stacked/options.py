@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from utils import check_config
+from utils import check_config, has_value_network
 
 from torchrl_ecpo.experiment.options import compose_options, expand, parse
 from torchrl_ecpo.experiment.run import flatten
@@ -91,6 +91,11 @@ def _check_together(runs: Sequence[DictConfig]) -> None:
     if first.env.kind not in KINDS:
         raise ValueError(
             f"Tasks of the kinds {KINDS} can be stacked, got env.kind={first.env.kind!r}. Start "
+            "processes instead: --multirun seed=0,1"
+        )
+    if any(has_value_network(run.loss) for run in runs):
+        raise ValueError(
+            "A loss with a value network, such as loss=trust_pcl, cannot be stacked. Start "
             "processes instead: --multirun seed=0,1"
         )
     flat = [flatten(OmegaConf.to_container(run, resolve=True)) for run in runs]
