@@ -161,8 +161,9 @@ def make_loss(
     if has_value_network(config):
         assert make_value_network is not None
         options["value_network"] = make_value_network()
-    loss_module = loss_class(config)(actor, **options)
-    head: Any = actor[-1] if isinstance(actor, ProbabilisticTensorDictSequential) else None
+    policy: Any = actor
+    loss_module = loss_class(config)(policy, **options)
+    head = policy[-1] if isinstance(actor, ProbabilisticTensorDictSequential) else None
     if head is not None and len(head.dist_sample_keys) > 1:
         names = {"action": head.dist_sample_keys, "sample_log_prob": head.log_prob_keys}
         loss_module.set_keys(**names)
