@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from random import Random
 
 import hydra
@@ -13,7 +12,7 @@ import torch
 from omegaconf import DictConfig
 from tasks import TASKS
 from torch.nn.utils import clip_grad_norm_
-from utils import Policy, check_model, make_loss, make_model, total_loss
+from utils import Policy, check_model, make_loss, make_model
 
 from torchrl_ecpo.experiment import Checkpoints, Progress, Run, check_command_line
 
@@ -41,16 +40,16 @@ def main(config: DictConfig) -> None:
     with run, checkpoints.attach(run, progress, model=model, optimizer=optimizer):
         if progress.batches == 0:
             policy.supervise(config.supervised, Random(f"supervised {config.seed}"))
-            run.log(policy.evaluate(config.evaluation, Path("completions.txt")), step=0)
+            run.log(policy.evaluate(config.evaluation), step=0)
         while progress.completions < config.total_completions:
-            # The prompts are those of the seed and the batch, for every method.
-            random = Random(f"{config.seed} {progress.batches}")
+            random = Random(f"{config.seed} {progress.batches}")  # for every method the same
             prompts = [task.draw(random)[0] for _ in range(config.num_prompts)]
             batch = policy.sample_groups(prompts, config.group_size)
             for _ in range(config.epochs):
                 losses = loss_module(batch)
                 optimizer.zero_grad()
-                total_loss(losses).backward()
+                parts = [x.sum() for name, x in losses.items() if name.startswith("loss_")]
+                torch.stack(parts).sum().backward()
                 grad_norm = clip_grad_norm_(model.parameters(), config.optim.max_grad_norm)
                 run.check({"grad_norm": grad_norm}, progress.completions)
                 optimizer.step()
@@ -58,11 +57,9 @@ def main(config: DictConfig) -> None:
             progress.completions += len(batch)
             metrics = {name: value.detach().mean() for name, value in losses.items()}
             metrics |= {"grad_norm": grad_norm} | policy.measure(batch)
-            if (
-                progress.batches % config.evaluation.interval == 0
-                or progress.completions >= config.total_completions
-            ):
-                metrics |= policy.evaluate(config.evaluation, Path("completions.txt"))
+            is_over = progress.completions >= config.total_completions
+            if is_over or progress.batches % config.evaluation.interval == 0:
+                metrics |= policy.evaluate(config.evaluation)
             run.log(metrics, step=progress.completions)
             checkpoints.boundary()
 
