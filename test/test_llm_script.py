@@ -1,4 +1,4 @@
-"""The script of language models: its tasks by hand, every loss once, resuming, a model of one's own."""
+"""The script of language models: tasks by hand, every loss once, resuming, a model of one's own."""
 
 from __future__ import annotations
 
