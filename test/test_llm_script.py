@@ -39,7 +39,9 @@ def modules(monkeypatch):
 
 
 def run_llm(directory, *options):
-    process = run_script(directory, SCRIPT, *TINY, *options)
+    flags = [option for option in options if option.startswith("--")]
+    options = [option for option in options if option not in flags]
+    process = run_script(directory, SCRIPT, *flags, *TINY, *options)
     assert process.returncode == 0, process.stderr
     return process.stdout
 
@@ -138,13 +140,20 @@ def test_a_model_of_ones_own(modules, tmp_path):
         ("task=chess", "task must be countdown or sums, got 'chess'."),
         ("group_size=1", "group_size must be an integer >= 2, got 1."),
         ("evaluation.completions=8", "evaluation.completions must be an integer >= 64, got 8."),
-        ("model.path=nowhere", r"model.path=nowhere: it must be .* \*.safetensors, and there is"),
+        ("model.path=nowhere", r"model.path=nowhere: it must be a directory with a model in \*."),
+        (
+            "model.path=no_tokenizer",
+            "with a model in .* and its tokenizer, as model.save_pretrained",
+        ),
         ("model.path=no_padding", "needs an end and a padding token of its own, got pad_token="),
     ],
 )
 def test_what_is_wrong_is_named(modules, monkeypatch, tmp_path, options, message):
     monkeypatch.chdir(tmp_path)
-    if "no_padding" in options:
-        save_model(modules("utils"), tmp_path / "no_padding", pad_token="<end>")
+    if "no_" in options:
+        directory = tmp_path / options.removeprefix("model.path=")
+        save_model(modules("utils"), directory, pad_token="<end>")
+        if "no_tokenizer" in options:
+            (directory / "tokenizer_config.json").unlink()
     with pytest.raises(ValueError, match=message):
         modules("utils").check_model(compose_options(SCRIPT.parent, [options]))

@@ -29,13 +29,12 @@ PASSES = (1, 8, 64)
 
 def check_model(config: DictConfig) -> None:
     """Refuse a directory without a model that can be read, or with a tokenizer that cannot pad."""
-    path = config.model.path
-    if path is None:
+    if (path := config.model.path) is None:
         return
-    if not list(Path(path).glob("*.safetensors")):
+    if not all(map(list, map(Path(path).glob, ("*.safetensors", "tokenizer_config.json")))):
         raise ValueError(
-            f"model.path={path}: it must be a directory with a model in *.safetensors, and there "
-            "is none. Save one with model.save_pretrained and tokenizer.save_pretrained."
+            f"model.path={path}: it must be a directory with a model in *.safetensors and its "
+            "tokenizer, as model.save_pretrained and tokenizer.save_pretrained write them."
         )
     tokenizer: Any = transformers.AutoTokenizer.from_pretrained(path, **LOCAL)
     padding, end = tokenizer.pad_token, tokenizer.eos_token
