@@ -109,6 +109,7 @@ def test_every_loss_trains(tmp_path):
     assert len(set(map(tuple, start.values()))) == 1  # one model, before the first update
 
 
+@pytest.mark.slow  # three times the import of transformers
 def test_a_run_goes_on_with_the_same_numbers(tmp_path):
     whole, part = tmp_path / "whole", tmp_path / "part"
     whole.mkdir(), part.mkdir()
@@ -126,12 +127,19 @@ def save_model(utils, directory, **special):
         setattr(tokenizer, name, token)
     model.save_pretrained(directory)
     tokenizer.save_pretrained(directory)
+    return model
 
 
-def test_a_model_of_ones_own(modules, tmp_path):
-    save_model(modules("utils"), tmp_path / "model")
-    run_llm(tmp_path, "model.path=model", f"hydra.run.dir={tmp_path}")
-    assert read_metrics(tmp_path)["step"] == [0, 6, 12]
+def test_a_model_of_ones_own(modules, monkeypatch, tmp_path):
+    utils = modules("utils")
+    saved = save_model(utils, tmp_path / "model")
+    monkeypatch.chdir(tmp_path)
+    config = compose_options(SCRIPT.parent, ["model.path=model"])
+    utils.check_model(config)
+    model, tokenizer = utils.make_model(config.model)
+    torch.testing.assert_close(dict(model.named_parameters()), dict(saved.named_parameters()))
+    assert model.generation_config.top_k == 0
+    assert tokenizer.decode(tokenizer("2,5=7:5+2").input_ids) == "2,5=7:5+2"
 
 
 @pytest.mark.parametrize(
