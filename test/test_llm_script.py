@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import importlib
 import re
 import sys
@@ -165,3 +166,15 @@ def test_what_is_wrong_is_named(modules, monkeypatch, tmp_path, options, message
             (directory / "tokenizer_config.json").unlink()
     with pytest.raises(ValueError, match=message):
         modules("utils").check_model(compose_options(SCRIPT.parent, [options]))
+
+
+def test_the_page_says_what_was_measured():
+    root = Path(__file__).parents[1]
+    page = (root / "docs/tutorials/language_models.md").read_text()
+    rows = csv.DictReader((root / "sota-implementations/results/llm/countdown.csv").open())
+    last = {(row["loss"], row["lr"]): row for row in rows if row["seed"] == "1"}
+    assert len(last) == 4
+    for (loss, lr), row in last.items():
+        names = ("pass_at_1", "pass_at_8", "pass_at_64", "distinct_right")
+        cells = " | ".join(f"{float(row[name]):.2f}" for name in names)
+        assert f"| {loss.upper()} | {lr} | {cells} |" in page
