@@ -1,0 +1,185 @@
+"""The script of language models: tasks by hand, every loss once, resuming, a model of one's own."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import re
+import sys
+from pathlib import Path
+from random import Random
+
+import pytest
+
+pytest.importorskip("transformers")
+
+import torch
+from omegaconf import OmegaConf
+from processes import run_script
+
+from torchrl_ecpo.experiment import compose_options, read_metrics
+
+SCRIPT = Path(__file__).parents[1] / "sota-implementations/llm/llm.py"
+TINY = (
+    *("supervised.steps=2", "supervised.batch_size=4", "model.hidden_size=16", "model.layers=1"),
+    *("num_prompts=2", "group_size=3", "evaluation.prompts=2", "evaluation.completions=64"),
+    *("evaluation.interval=1", "total_completions=12"),
+)
+MODULES = ("tasks", "utils")
+
+
+@pytest.fixture
+def modules(monkeypatch):
+    """Imports what is beside the script, as if it were started from there."""
+    monkeypatch.syspath_prepend(str(SCRIPT.parent))
+    for name in MODULES:
+        sys.modules.pop(name, None)
+    yield importlib.import_module
+    for name in MODULES:
+        sys.modules.pop(name, None)
+
+
+def run_llm(directory, *options):
+    flags = [option for option in options if option.startswith("--")]
+    options = [option for option in options if option not in flags]
+    process = run_script(directory, SCRIPT, *flags, *TINY, *options)
+    assert process.returncode == 0, process.stderr
+    return process.stdout
+
+
+def test_answers_are_verified(modules):
+    tasks = modules("tasks").TASKS
+    for answer, is_right in {
+        **{"5+8": True, "8+5": True, "6-2+9": False, "2+5+6": True},  # 9 is no digit of the prompt
+        **{"5+8+6-6": False, "13": False, "+5+8": False, "5+8=13": False, "": False, "5+": False},
+    }.items():
+        assert tasks["countdown"].is_right("2,5,6,8=13:", answer) is is_right, answer
+    assert tasks["countdown"].is_right("1,3,4,7=7:", "7")
+    assert tasks["sums"].is_right("5+9-3=", "11")
+    assert tasks["sums"].is_right("1-9=", "-8")
+    assert not tasks["sums"].is_right("5+9-3=", "12")
+    random = Random(0)
+    for task in tasks.values():
+        for prompt, answer in (task.draw(random) for _ in range(200)):
+            assert task.is_right(prompt, answer)
+            assert len(answer) < task.max_tokens  # the end is a token
+
+
+def test_pass_at_k_by_hand(modules):
+    """Of four answers one is right: a draw of two has it with probability 1 - 3/4 * 2/3."""
+    pass_at = modules("utils").pass_at
+    assert pass_at(1, 4, 1) == 0.25
+    assert pass_at(2, 4, 1) == 0.5
+    assert pass_at(4, 4, 1) == 1.0
+    assert pass_at(2, 4, 0) == 0.0
+
+
+def test_the_entropy_is_that_of_the_completions(modules):
+    """Of a model whose tokens are all as likely, a completion has length * log(vocabulary) nats."""
+    utils = modules("utils")
+    config = OmegaConf.create({"path": None, "hidden_size": 8, "layers": 1})
+    model, tokenizer = utils.make_model(config)
+    torch.nn.init.zeros_(model.lm_head.weight)
+    policy = utils.Policy(model, tokenizer, modules("tasks").TASKS["countdown"])
+    torch.manual_seed(0)
+    batch = policy.sample_groups(["1,2,3,4=5:", "6,7,8,9=13:"], 5)  # of other lengths
+    measured = policy.measure(batch)
+    expected = measured["length"] * torch.tensor(len(tokenizer)).log()
+    torch.testing.assert_close(measured["entropy"], expected)
+    assert batch["query"].tolist() == [0] * 5 + [1] * 5
+    assert batch["advantage"].shape == (10, 1, 1)
+
+
+def test_every_loss_trains(tmp_path):
+    run_llm(
+        tmp_path,
+        *("--multirun", "loss=ecpo,pmd,tpo,grpo", "task=sums", f"hydra.sweep.dir={tmp_path}"),
+        "hydra.sweep.subdir=${loss.name}",
+    )
+    start = {}
+    for loss in ("ecpo", "pmd", "tpo", "grpo"):
+        metrics = read_metrics(tmp_path / loss)
+        assert metrics["step"] == [0, 6, 12]
+        names = ("pass_at_1", "pass_at_8", "pass_at_64", "distinct_right")
+        start[loss] = [metrics[name][0] for name in names]
+        assert 0 < metrics["length"][1] <= 4
+        assert metrics["grad_norm"][1] >= 0
+        assert (tmp_path / loss / "curve.png").exists()
+        listed = (tmp_path / loss / "completions.txt").read_text()
+        assert re.search(r"^ +\d+ (right|wrong)  ", listed, re.MULTILINE)
+    assert len(set(map(tuple, start.values()))) == 1  # one model, before the first update
+
+
+@pytest.mark.slow  # three times the import of transformers
+def test_a_run_goes_on_with_the_same_numbers(tmp_path):
+    whole, part = tmp_path / "whole", tmp_path / "part"
+    whole.mkdir(), part.mkdir()
+    run_llm(whole, f"hydra.run.dir={whole}")
+    run_llm(part, f"hydra.run.dir={part}", "total_completions=6")
+    assert "Resumed" in run_llm(part, f"resume={part}")
+    assert (part / "metrics.csv").read_text() == (whole / "metrics.csv").read_text()
+    assert (part / "completions.txt").read_text() == (whole / "completions.txt").read_text()
+
+
+def save_model(utils, directory, **special):
+    config = OmegaConf.create({"path": None, "hidden_size": 16, "layers": 1})
+    model, tokenizer = utils.make_model(config)
+    for name, token in special.items():
+        setattr(tokenizer, name, token)
+    model.save_pretrained(directory)
+    tokenizer.save_pretrained(directory)
+    return model
+
+
+def test_a_model_of_ones_own(modules, monkeypatch, tmp_path):
+    utils = modules("utils")
+    saved = save_model(utils, tmp_path / "model")
+    monkeypatch.chdir(tmp_path)
+    config = compose_options(SCRIPT.parent, ["model.path=model"])
+    utils.check_model(config)
+    model, tokenizer = utils.make_model(config.model)
+    torch.testing.assert_close(dict(model.named_parameters()), dict(saved.named_parameters()))
+    assert model.generation_config.top_k == 0
+    assert tokenizer.decode(tokenizer("2,5=7:5+2").input_ids) == "2,5=7:5+2"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("task=chess", "task must be countdown or sums, got 'chess'."),
+        ("group_size=1", "group_size must be an integer >= 2, got 1."),
+        ("evaluation.completions=8", "evaluation.completions must be an integer >= 64, got 8."),
+        ("model.path=nowhere", r"model.path=nowhere: it must be a directory with a model in \*."),
+        (
+            "model.path=no_tokenizer",
+            "with a model in .* and its tokenizer, as model.save_pretrained",
+        ),
+        ("model.path=no_padding", "needs an end and a padding token of its own, got pad_token="),
+    ],
+)
+def test_what_is_wrong_is_named(modules, monkeypatch, tmp_path, options, message):
+    monkeypatch.chdir(tmp_path)
+    if "no_" in options:
+        directory = tmp_path / options.removeprefix("model.path=")
+        save_model(modules("utils"), directory, pad_token="<end>")
+        if "no_tokenizer" in options:
+            (directory / "tokenizer_config.json").unlink()
+    with pytest.raises(ValueError, match=message):
+        modules("utils").check_model(compose_options(SCRIPT.parent, [options]))
+
+
+def test_the_page_says_what_was_measured():
+    root = Path(__file__).parents[1]
+    page = (root / "docs/tutorials/language_models.md").read_text()
+    table = (root / "sota-implementations/results/llm/countdown.csv").read_text()
+    rows = csv.DictReader(table.splitlines())
+    names = ("pass_at_1", "pass_at_8", "pass_at_64", "distinct_right")
+    runs: dict[tuple[str, str], list[list[float]]] = {}
+    for row in rows:
+        if row["completions"] == "7680":
+            measured = [float(row[name]) for name in names]
+            runs.setdefault((row["loss"], row["lr"]), []).append(measured)
+    for (loss, lr), seeds in runs.items():
+        means = [sum(values) / len(values) for values in zip(*seeds, strict=True)]
+        cells = " | ".join(f"{mean:.2f}" for mean in means)
+        assert f"| {loss.upper()} | {lr} | {len(seeds)} | {cells} |" in page
