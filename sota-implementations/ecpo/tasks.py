@@ -117,7 +117,7 @@ def make_bandit(config: DictConfig) -> Task:
 
 
 def make_deep_sea(config: DictConfig) -> Task:
-    """bsuite's deep sea; the policy is a table of logits, for each cell two."""
+    """The deep sea of bsuite; the policy is a table of logits, for each cell two."""
     make_env = partial(
         DeepSeaEnv,
         config.env.size,

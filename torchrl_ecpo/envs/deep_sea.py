@@ -19,9 +19,9 @@ class DeepSeaEnv(EnvBase):
 
     The problem of Osband et al., Behaviour Suite for Reinforcement Learning (ICLR 2020), with its
     rules and without noise. The diver starts at the upper left. One of two actions moves it right,
-    which costs 0.01 / `size`, the other left; which is which is drawn for each cell. Moving right in
-    the last column, which only a diver that has always moved right ever reaches, earns 1. So the
-    best return is 0.99, a policy that never moves right earns 0, and the uniform policy finds the
+    which costs 0.01 / `size`, the other left; which is which is drawn for each cell. Moving right
+    in the last column earns 1: only a diver that has always moved right comes there. So the best
+    return is 0.99, a policy that never moves right earns 0, and the uniform policy finds the
     treasure in :math:`2^{-N}` of the episodes.
 
     The tensordict holds ``observation`` (int64 ``[num_groups, group_size]``: the cell, `size` *
@@ -37,8 +37,8 @@ class DeepSeaEnv(EnvBase):
         device: where it lives.
 
     Raises:
-        ValueError: if a size is not positive, or the seed negative; when stepped, for an action or a
-            cell that does not exist.
+        ValueError: if a size is not positive, or the seed negative; when stepped, for an action or
+            a cell that does not exist.
 
     Examples:
         >>> env = DeepSeaEnv(2, group_size=3)
