@@ -124,6 +124,35 @@ def test_several_gradient_steps_on_a_batch(tmp_path):
     assert changed == {"kl_reference_policy", "gradient_steps", "expected_reward"}
 
 
+def test_tasks_of_exploration_say_how_many_episodes_are_solved(tmp_path):
+    run_ecpo(
+        tmp_path,
+        "--multirun",
+        "env=deep_sea,frozenlake,mountaincar",
+        "total_trajectories=20",
+        "num_groups=5",
+        "group_size=2",
+        f"hydra.sweep.dir={tmp_path}",
+        "hydra.sweep.subdir=${env.name}",
+    )
+    for name in ("deep_sea", "FrozenLake-v1", "MountainCar-v0"):
+        metrics = read_metrics(tmp_path / name)
+        assert len(metrics["pass_at_1"]) == 2
+        assert all(0 <= share <= 1 for share in metrics["pass_at_1"] + metrics["pass_at_k"])
+        assert metrics["pass_at_1"][0] <= metrics["pass_at_k"][0]
+
+
+def test_episodes_and_groups_that_earn_as_much_are_counted(script_modules):
+    reward = torch.tensor([[[0.0, 1.0], [0.0, 0.0]], [[0.5, 0.5], [0.5, 1.0]], [[0, 0], [0, 0.5]]])
+    done = torch.tensor([False, True]).expand(3, 2, 2).clone()
+    done[1, 1, 0] = True  # what is after the end earns nothing
+    step = {"reward": reward.unsqueeze(-1), "done": done.unsqueeze(-1)}
+    groups = TensorDict({"next": step}, [3, 2, 2])
+    passes = script_modules("tasks").passes(groups, solved=1)
+    assert passes["pass_at_1"] == pytest.approx(2 / 6)
+    assert passes["pass_at_k"] == pytest.approx(2 / 3)
+
+
 def test_metrics_of_a_batch_are_those_of_its_first_step_but_for_the_divergence(script_modules):
     is_far, of_batch = script_modules("utils").is_far, script_modules("utils").of_batch
     of_steps = [

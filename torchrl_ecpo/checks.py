@@ -144,6 +144,24 @@ def get_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
     return value
 
 
+def get_choice(
+    tensordict: TensorDictBase, key: NestedKey, shape: torch.Size, number: int
+) -> Tensor:
+    """An entry of integers from 0 to `number` - 1, of this shape."""
+    value = get_entry(tensordict, key)
+    if value.shape != shape or value.dtype not in (torch.int64, torch.int32):
+        raise ValueError(
+            f"{key!r} must be int64 of shape {list(shape)}, got {value.dtype} of shape "
+            f"{list(value.shape)}."
+        )
+    if bool(((value < 0) | (value >= number)).any().item()):
+        raise ValueError(
+            f"Each {key!r} must be an integer from 0 to {number - 1}, got {value.min().item()} to "
+            f"{value.max().item()}."
+        )
+    return value
+
+
 UNREADABLE = (RuntimeError, IndexError, TypeError, AttributeError, KeyError)
 """What a network raises when it is given what it cannot read."""
 

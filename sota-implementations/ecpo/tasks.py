@@ -44,6 +44,7 @@ from torchrl_ecpo.collectors import TrajectoryGroupCollector
 from torchrl_ecpo.envs import (
     AlgorithmicEnv,
     BanditEnv,
+    DeepSeaEnv,
     EpisodeReplay,
     make_grouped_env,
     readable,
@@ -85,7 +86,12 @@ class Task:
 
 def make_task(config: DictConfig) -> Task:
     """Build the task that ``env=`` names."""
-    makers = {"algorithmic": make_algorithmic, "bandit": make_bandit, "gym": make_gym}
+    makers = {
+        "algorithmic": make_algorithmic,
+        "bandit": make_bandit,
+        "deep_sea": make_deep_sea,
+        "gym": make_gym,
+    }
     return makers[config.env.kind](config)
 
 
@@ -113,6 +119,27 @@ def make_bandit(config: DictConfig) -> Task:
     task = Task(env, make_env, actor, measure, lambda groups: {}, shown)
     task.make_value_network = lambda: ValueOperator(nn.Linear(1, 1))
     return task
+
+
+def make_deep_sea(config: DictConfig) -> Task:
+    """The deep sea of bsuite; the policy is a table of logits, for each cell two."""
+    make_env = partial(
+        DeepSeaEnv,
+        config.env.size,
+        instance_seed=config.env.instance_seed,
+        group_size=config.group_size,
+    )
+    table = nn.Embedding(config.env.size**2 + 1, 2)
+    nn.init.zeros_(table.weight)  # the uniform policy
+    actor = ProbabilisticActor(
+        TensorDictModule(table, ["observation"], ["logits"]),
+        in_keys=["logits"],
+        distribution_class=Categorical,
+        return_log_prob=True,
+    )
+    env = make_env(num_groups=config.num_groups)
+    shown = ("return", "pass_at_1", "pass_at_k", "entropy", "ESS")
+    return Task(env, make_env, actor, partial(passes, solved=0.5), lambda groups: {}, shown)
 
 
 def make_algorithmic(config: DictConfig) -> Task:
@@ -248,7 +275,9 @@ def make_gym(config: DictConfig) -> Task:
     actor = make_feed_forward_policy(env, config.env.hidden_sizes)
 
     def measure(groups: TensorDictBase) -> Metrics:
-        return {"length": groups["collector", "mask"].sum(-1).float().mean()}
+        length = groups["collector", "mask"].sum(-1).float().mean()
+        solved = config.env.solved
+        return {"length": length} | ({} if solved is None else passes(groups, solved))
 
     def evaluate(groups: TensorDictBase) -> Metrics:
         return {"greedy_return": _returns(greedy(evaluation_env, actor)).mean()}
@@ -393,6 +422,12 @@ def greedy(env: EnvBase, actor: ProbabilisticTensorDictSequential) -> TensorDict
     """One whole episode in each row, with the most probable actions."""
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         return env.rollout(10_000, actor, break_when_any_done=False, break_when_all_done=True)
+
+
+def passes(groups: TensorDictBase, solved: float) -> Metrics:
+    """Share of episodes, and of groups with one of them, that earn as much."""
+    is_high = _returns(groups) >= solved
+    return {"pass_at_1": is_high.float().mean(), "pass_at_k": is_high.any(1).float().mean()}
 
 
 def distinct_solutions(groups: TensorDictBase) -> float:

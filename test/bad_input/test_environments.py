@@ -10,6 +10,7 @@ from torchrl.envs import GymEnv, TransformedEnv
 from torchrl_ecpo.envs import (
     AlgorithmicEnv,
     BanditEnv,
+    DeepSeaEnv,
     EpisodeReplay,
     GroupedEnv,
     GroupIdAllocator,
@@ -41,6 +42,17 @@ def bandit(entries):
 
 def play_bandit(entries):
     return act(BanditEnv(num_actions=5, num_groups=2, group_size=3), entries)
+
+
+def deep_sea(entries):
+    env = DeepSeaEnv(**entries)
+    return env.right, env.reset()["group"].shape
+
+
+def dive(entries):
+    env = DeepSeaEnv(3, num_groups=2, group_size=3)
+    after = env.step(tensordict_of(entries, env.batch_size))["next"]
+    return after["observation"], after["reward"]
 
 
 def expected_reward(entries):
@@ -169,6 +181,19 @@ SUBJECTS = {
         {"probabilities": torch.full((2, 4), 0.25)},
         hands_on_nan=True,
         fine={("probabilities", name): "any batch" for name in ANY_BATCH},
+    ),
+    "DeepSeaEnv": Subject(
+        deep_sea,
+        {"size": 3, "instance_seed": 1, "num_groups": 2, "group_size": 3},
+        optional=["size", "instance_seed", "num_groups", "group_size"],
+        fine={("instance_seed", "0"): SEED},
+    ),
+    "DeepSeaEnv.step": Subject(
+        dive,
+        {
+            "observation": torch.tensor([[0, 3, 4], [6, 7, 8]]),
+            "action": torch.tensor([[0, 1, 1], [0, 1, 0]]),
+        },
     ),
     "AlgorithmicEnv": Subject(
         algorithmic,

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 from torchrl_ecpo.envs._groups import GroupIdAllocator
 from torchrl_ecpo.envs.algorithmic import TASKS, AlgorithmicEnv, AlgorithmicTask
 from torchrl_ecpo.envs.bandit import BanditEnv
+from torchrl_ecpo.envs.deep_sea import DeepSeaEnv
 from torchrl_ecpo.envs.grouped import GroupedEnv
 from torchrl_ecpo.envs.replay import EpisodeReplay
 
@@ -18,6 +19,7 @@ __all__ = [
     "AlgorithmicEnv",
     "AlgorithmicTask",
     "BanditEnv",
+    "DeepSeaEnv",
     "EpisodeReplay",
     "GroupIdAllocator",
     "GroupedEnv",

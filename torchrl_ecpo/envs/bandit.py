@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_ecpo.checks import as_float, check_count, check_kind, described, get_entry
+from torchrl_ecpo.checks import as_float, check_count, check_kind, described, get_choice
 from torchrl_ecpo.envs._groups import GroupIdAllocator
 
 __all__ = ["BanditEnv"]
@@ -109,18 +109,7 @@ class BanditEnv(EnvBase):
         return self._output(done=False)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = get_entry(tensordict, "action")
-        num_actions = self.rewards.shape[-1]
-        if action.shape != self.batch_size or action.dtype not in (torch.int64, torch.int32):
-            raise ValueError(
-                f"'action' must be int64 of shape {list(self.batch_size)}, got {action.dtype} of "
-                f"shape {list(action.shape)}."
-            )
-        if bool(((action < 0) | (action >= num_actions)).any().item()):
-            raise ValueError(
-                f"An action of the bandit must be an integer from 0 to {num_actions - 1}, got "
-                f"{action.min().item()} to {action.max().item()}."
-            )
+        action = get_choice(tensordict, "action", self.batch_size, self.rewards.shape[-1])
         return self._output(done=True).set("reward", self._reward(action).unsqueeze(-1))
 
     def _reward(self, action: Tensor) -> Tensor:
