@@ -42,7 +42,7 @@ nitpicky = True
 nitpick_ignore_regex = [
     (
         "py:.*",
-        r"(collections|hydra|matplotlib|numpy|omegaconf|pathlib|tensordict|torch|torchrl|types|typing)"
+        r"(collections|gymnasium|hydra|matplotlib|numpy|omegaconf|pathlib|tensordict|torch|torchrl|types|typing)"
         r"\..*",
     ),
     (

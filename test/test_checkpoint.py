@@ -409,10 +409,13 @@ def test_options_in_which_the_same_run_may_differ():
 
 
 def test_a_second_signal_does_not_wait(tmp_path):
+    # A shell lets what it starts in the background ignore SIGINT.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     with attach(tmp_path):
         os.kill(os.getpid(), signal.SIGINT)
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize("save_at", [None, 1])

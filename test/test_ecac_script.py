@@ -16,6 +16,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from processes import run_script
 from tensordict import TensorDict
+from torchrl.envs import GymEnv
 from torchrl.objectives import SACLoss
 
 from torchrl_ecpo.experiment import read_metrics
@@ -421,7 +422,7 @@ def test_every_asks_once_an_interval(utils):
 
 def test_the_score_function_gradient_is_the_reparameterised_one_in_expectation(utils):
     torch.manual_seed(0)
-    spec = utils.GymEnv("Pendulum-v1").action_spec
+    spec = GymEnv("Pendulum-v1").action_spec
     networks = (
         utils.make_tanh_gaussian_actor(3, spec, hidden_sizes=[4]),
         utils.make_qvalue_network(3, 1, hidden_sizes=[4]),
@@ -441,7 +442,7 @@ def test_the_score_function_gradient_is_the_reparameterised_one_in_expectation(u
 def test_width_sac_changes_the_policy_s_width_alone(utils):
     """With phi = 1 nothing; with less, alpha (1 - phi) log sigma is added."""
     torch.manual_seed(0)
-    spec = utils.GymEnv("Pendulum-v1").action_spec
+    spec = GymEnv("Pendulum-v1").action_spec
     actor = utils.make_tanh_gaussian_actor(3, spec, hidden_sizes=[4])
     qvalue = utils.make_qvalue_network(3, 1, hidden_sizes=[4])
     batch = TensorDict({"observation": torch.randn(50, 3)}, [50])
