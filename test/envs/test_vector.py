@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from functools import partial
 
+import cloudpickle
 import gymnasium
 import numpy as np
 import pytest
@@ -90,6 +92,10 @@ def test_a_collector_goes_on_where_it_was():
         one.shutdown()
     for key in ("observation", "action", ("next", "reward"), ("collector", "mask")):
         assert torch.equal(batches[0][key], batches[1][key])
+
+
+# A worker process cannot import this file by its name.
+cloudpickle.register_pickle_by_value(sys.modules[__name__])
 
 
 class Countdown(gymnasium.Env):
