@@ -241,6 +241,7 @@ def test_a_sweep_over_two_processes_gives_the_metrics_of_single_runs(
             "logger.backend=tensorboard",
         ),
         ("env=gym", "total_trajectories=64", "env.max_steps=5", "evaluation_interval=1"),
+        ("env=deep_sea", "total_trajectories=64", "loss=trust_pcl"),  # with a value network
         (
             "env=gym",
             "env.name=Pendulum-v1",

@@ -139,7 +139,9 @@ def make_deep_sea(config: DictConfig) -> Task:
     )
     env = make_env(num_groups=config.num_groups)
     shown = ("return", "pass_at_1", "pass_at_k", "entropy", "ESS")
-    return Task(env, make_env, actor, partial(passes, solved=0.5), lambda groups: {}, shown)
+    task = Task(env, make_env, actor, partial(passes, solved=0.5), lambda groups: {}, shown)
+    task.make_value_network = lambda: ValueOperator(nn.Embedding(config.env.size**2 + 1, 1))
+    return task
 
 
 def make_algorithmic(config: DictConfig) -> Task:
