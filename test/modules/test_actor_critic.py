@@ -308,7 +308,7 @@ def test_networks_of_vectors_and_of_pixels_write_the_same_entries(observation_si
     assert qvalue["state_action_value"].shape == (5, 1)
 
 
-@pytest.mark.parametrize("spec", [Categorical(3, shape=(2,)), MultiCategorical([2, 3]), SPEC])
+@pytest.mark.parametrize("spec", [Categorical(3, shape=(2,)), MultiCategorical([2, 3]), SPEC, 4])
 def test_a_categorical_actor_takes_one_discrete_action(spec):
     with pytest.raises(ValueError, match="action_spec must be of one discrete action"):
         make_categorical_actor(3, spec)

@@ -554,6 +554,11 @@ def test_a_copy_of_a_compiled_loss_trains_itself():
     pickle.dumps(loss)
 
 
+def _taken(loss, batch):
+    """Soft Q ``[N, *B]`` of the actions of a batch."""
+    return loss._qvalues(batch.select(*loss.qvalue_network.in_keys), loss.qvalue_network_params)
+
+
 def test_dropout_of_a_copy_is_its_own():
     """A copy calls its own Q network, not the original's."""
     networks = make_networks()
@@ -561,9 +566,9 @@ def test_dropout_of_a_copy_is_its_own():
     network = MLP(in_features=size, out_features=1, num_cells=[8], dropout=0.5).double()
     networks.qvalues = ValueOperator(network, ["observation", "action"])  # type: ignore
     copy = deepcopy(CASE.build(networks))
-    assert not torch.equal(*(copy._chosen_qvalue(_batch()) for _ in range(2)))
+    assert not torch.equal(*(_taken(copy, _batch()) for _ in range(2)))
     copy.qvalue_network.eval()
-    assert torch.equal(*(copy._chosen_qvalue(_batch()) for _ in range(2)))
+    assert torch.equal(*(_taken(copy, _batch()) for _ in range(2)))
 
 
 def test_recurrent_q_network():
@@ -582,7 +587,7 @@ def test_recurrent_q_network():
     batch["recurrent_state_h"], batch["recurrent_state_c"] = states
     batch["is_init"] = torch.zeros(3, 5, 1, dtype=torch.bool)
     with set_recurrent_mode(True):
-        chosen = loss._chosen_qvalue(batch).amin(0)
+        chosen = _taken(loss, batch).amin(0)
         sampled = loss.states(batch).lift.actions._replace(
             action=batch["action"].expand(4, 3, 5, 2)
         )

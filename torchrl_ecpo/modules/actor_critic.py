@@ -365,7 +365,7 @@ def make_categorical_actor(
     if not isinstance(spec, CategoricalSpec) or spec.ndim:
         raise ValueError(
             "action_spec must be of one discrete action (torchrl's Categorical, of shape ()), got "
-            f"{type(spec).__name__} of shape {tuple(spec.shape)}. Several actions belong to the "
+            f"{type(spec).__name__} of shape {tuple(getattr(spec, 'shape', ()))}. Several actions belong to the "
             "losses of groups, such as ECPOLoss."
         )
     return ProbabilisticActor(

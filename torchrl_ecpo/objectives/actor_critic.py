@@ -6,6 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
@@ -317,10 +318,15 @@ class ActorCriticLoss(PolicyLoss):
     ) -> tuple[dict[str, Tensor], Tensor]:
         """All outputs, checked, and the temporal difference error ``[*B]``."""
         target = self.soft_bellman_target(transitions, mask)
-        qvalue = self._chosen_qvalue(transitions, mask)
+        inputs = transitions.select(*self.qvalue_network.in_keys)
+        qvalues = self._qvalues(inputs, self.qvalue_network_params)
+        qvalue = self._chosen_qvalue(qvalues, transitions, mask)
         td_error = (qvalue.detach() - target).abs().amax(0)
         errors = distance_loss(qvalue, target.expand_as(qvalue), self.loss_function)  # Eq. 10
         states = self.states(transitions, mask)
+        if not self._reads_action:  # the network has valued all actions: it is not asked twice
+            first = qvalues.detach()[:, : self.num_actor_states]
+            states.make_lift = partial(self.lift, qvalues=first)
         surrogate = self.project(states)
         own = {name: x for name, x in surrogate.metrics.items() if name != "kl_target_reference"}
         self._check_declared(surrogate.losses, own)
@@ -363,6 +369,7 @@ class ActorCriticLoss(PolicyLoss):
         reference: Distribution,
         qvalue_params: TensorDictParams | None = None,
         num_samples: int | None = None,
+        qvalues: Tensor | None = None,
     ) -> Lift:
         """Lift the reference policy at each state ``[*B]``: Eq. 8, by samples or over all actions.
 
@@ -371,12 +378,17 @@ class ActorCriticLoss(PolicyLoss):
             reference: the policy at these states.
             qvalue_params: of the Q networks; those that are trained by default.
             num_samples: M; ``num_action_samples`` by default.
+            qvalues: ``[N, *B, n]``, of all n actions, where they are known.
         """
         number = self.num_action_samples if num_samples is None else num_samples
         params = self.qvalue_network_params if qvalue_params is None else qvalue_params
         with torch.no_grad():
             actions = actions_of(reference, number)
-            return self.lifted(actions, self.score_of(observations, actions, params))
+            if qvalues is None or isinstance(actions, SampledActions):
+                score = self.score_of(observations, actions, params)
+            else:
+                score = qvalues.amin(0).movedim(-1, 0)
+            return self.lifted(actions, score)
 
     def lifted(self, actions: Actions, score: Tensor, slope: Tensor | None = None) -> Lift:
         """The lift, of actions that have been valued."""
@@ -494,10 +506,10 @@ class ActorCriticLoss(PolicyLoss):
         number, critics = self.num_next_action_samples, self.target_qvalue_network_params
         return self.lift(observations, policy, critics, number).value
 
-    def _chosen_qvalue(self, tensordict: TensorDictBase, mask: Tensor | None = None) -> Tensor:
-        """Soft Q ``[N, *B]`` of the actions that were taken; carries the gradient."""
-        inputs = tensordict.select(*self.qvalue_network.in_keys)
-        qvalues = self._qvalues(inputs, self.qvalue_network_params)
+    def _chosen_qvalue(
+        self, qvalues: Tensor, tensordict: TensorDictBase, mask: Tensor | None
+    ) -> Tensor:
+        """Soft Q ``[N, *B]`` of the actions that were taken."""
         if self._reads_action:
             return qvalues
         action = tensordict.get(self.tensor_keys.action)
