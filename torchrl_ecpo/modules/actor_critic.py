@@ -365,8 +365,8 @@ def make_categorical_actor(
     if not isinstance(spec, CategoricalSpec) or spec.ndim:
         raise ValueError(
             "action_spec must be of one discrete action (torchrl's Categorical, of shape ()), got "
-            f"{type(spec).__name__} of shape {tuple(getattr(spec, 'shape', ()))}. Several actions belong to the "
-            "losses of groups, such as ECPOLoss."
+            f"{type(spec).__name__} of shape {tuple(getattr(spec, 'shape', ()))}. Several actions "
+            "belong to the losses of groups, such as ECPOLoss."
         )
     return ProbabilisticActor(
         _network(observation_size, ["logits"], hidden_sizes, spec.n),
