@@ -336,9 +336,10 @@ def curves_figure(
 
 
 def is_drawn(curves: Mapping[str, Curve]) -> bool:
-    """Whether a task has enough for a panel: half of the methods several runs of some points."""
-    enough = [len(v) > 1 and len(steps) >= FEW_POINTS for steps, v in curves.values()]
-    return sum(enough) >= len(enough) / 2
+    """Whether a task has enough for a panel: half of the methods several runs, and no few dots."""
+    several = [len(values) > 1 for _, values in curves.values()]
+    points = [len(steps) for steps, _ in curves.values()]
+    return sum(several) >= len(several) / 2 and min(points) >= FEW_POINTS
 
 
 def heat_maps(study: Study, cells: Sequence[CellResult], docs: Path) -> str:
