@@ -32,10 +32,8 @@ demo: install ## compare ECPO, UREX and Dr.GRPO on Reverse, and ECPO, UREX and M
 		hydra.run.dir=runs/demo/reverse
 	$(RUN) sota-implementations/ecpo/ecpo.py env=bandit \
 		'stack=["loss=ecpo,urex,ment seed=1,2,3"]' hydra.run.dir=runs/demo/bandit
-	@$(RUN) -m torchrl_ecpo.experiment.compare runs/demo/reverse --metric return \
-		--title "Reverse" --x-label "trajectories"
-	@$(RUN) -m torchrl_ecpo.experiment.compare runs/demo/bandit --metric expected_reward \
-		--title "10,000-armed bandit" --x-label "sampled actions"
+	@$(RUN) -m torchrl_ecpo.experiment.compare runs/demo/reverse --title Reverse
+	@$(RUN) -m torchrl_ecpo.experiment.compare runs/demo/bandit --title "10,000-armed bandit"
 
 study: install ## make the runs of the study that are not in runs/study; ARGS='--missing', ARGS='--only figure1 --seeds 1-3'
 	$(RUN) sota-implementations/study/run.py $(ARGS)

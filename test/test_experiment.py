@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 
 import numpy as np
@@ -10,9 +11,9 @@ from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
 from torchrl_ecpo.experiment import MetricsTable, Run, read_metrics
-from torchrl_ecpo.experiment.compare import find_runs, load_comparison
+from torchrl_ecpo.experiment.compare import Comparison, find_runs, load_comparison
 from torchrl_ecpo.experiment.compare import main as compare
-from torchrl_ecpo.experiment.figures import draw_curve
+from torchrl_ecpo.experiment.figures import draw_curve, plot_learning_curve
 
 PNG = b"\x89PNG\r\n"
 
@@ -178,7 +179,8 @@ def runs(tmp_path, monkeypatch):
     curves = {"ecpo": [(1.0, 3.0, 5.0), (1.0, 5.0, 7.0)], "urex": [(0.0, 1.0, 2.0)]}
     for method, values in curves.items():
         for seed, returns in enumerate(values):
-            config = make_config(loss={"name": method, "tau": 0.1 * (seed + 1)})
+            loss = {"name": method, "tau": 0.1 * (seed + 1)}
+            config = make_config(loss=loss, total_trajectories=30)
             with make_run(tmp_path / method / str(seed), config) as run:
                 for i, value in enumerate(returns):
                     run.log({"return": value}, step=10 * (i + 1))
@@ -190,8 +192,22 @@ def test_comparison_puts_the_runs_of_a_method_together(runs):
     steps, values = comparison.curves["ecpo"]
     assert steps.tolist() == [10, 20, 30]
     assert values.tolist() == [[1, 3, 5], [1, 5, 7]]
-    assert "| ecpo | 2 | 30 | 6.000 ± 1.000 | 5.000 |" in comparison.table()
-    assert "| urex | 1 | 30 | 2.000 | 2.000 |" in comparison.table()
+    # 1, 3, 5 and 1, 5, 7: means of 3 and 4.5 over the run, by trapezoids.
+    assert "| ecpo | 2 | 30 | 3.750 ± 0.750 | 6.000 ± 1.000 | 5.000 |" in comparison.table()
+    assert "| urex | 1 | 30 | 1.000 | 2.000 | 2.000 |" in comparison.table()
+
+
+def test_comparison_ranks_methods_by_their_mean_over_the_run(runs):
+    steps, early, late = np.array([10.0, 20.0]), np.array([[4.0, 4.0]]), np.array([[0.0, 6.0]])
+    rows = Comparison("return", {"late": (steps, late), "early": (steps, early)}).table()
+    assert re.findall(r"\| (late|early) ", rows) == ["early", "late"]
+
+
+def test_the_metric_of_a_comparison_is_by_default_the_evaluation(runs):
+    assert load_comparison(find_runs([runs])).metric == "return"
+    with make_run(runs / "evaluated") as run:
+        run.log({"return": 1.0, "evaluation_return": 2.0}, step=10)
+    assert load_comparison([runs / "evaluated"]).metric == "evaluation_return"
 
 
 def test_comparison_tells_methods_apart_by_what_it_is_told(runs):
@@ -209,7 +225,8 @@ def test_compare_prints_a_table_and_writes_picture_and_curves(runs, capsys):
     printed = capsys.readouterr().out
     assert "| ecpo | 2 |" in printed
     assert str(output) in printed
-    assert "<svg" in output.read_text()
+    texts = re.findall(r"<text [^>]*>([^<]+)</text>", output.read_text())
+    assert {"ecpo", "urex", "trajectories", "return"} <= set(texts)
     lines = table.read_text().splitlines()
     assert lines[0] == "method,run,step,return"
     assert lines[-1] == "urex,0,30,2"
@@ -221,6 +238,21 @@ def test_a_curve_of_one_point_is_seen():
     draw_curve(panel, steps[:1], values[:, :1], color="k", label="one")
     draw_curve(panel, steps, values, color="k", label="two")
     assert [line.get_marker() for line in panel.lines] == ["o", "None"]
+
+
+def test_the_picture_of_a_run_has_a_panel_for_what_was_measured(tmp_path):
+    rows = [{"step": 10, "return": 1.0, "ESS": math.nan}, {"step": 20, "return": 2.0}]
+
+    def plot(metrics):
+        path = tmp_path / "curve.svg"
+        return plot_learning_curve(rows, path, metrics=metrics, title="a run", x_label="frames")
+
+    picture = plot(["return", "ESS", "entropy"]).read_text()
+    texts = re.findall(r"<text [^>]*>([^<]+)</text>", picture)
+    assert {"return", "a run", "frames"} <= set(texts)
+    assert {"ESS", "entropy"}.isdisjoint(texts)
+    assert picture.count("<use ") > 2, "two points are seen as points"
+    assert plot(["ESS", "entropy"]) is None
 
 
 def test_the_band_of_a_curve_is_the_standard_error_over_runs():

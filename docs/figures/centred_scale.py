@@ -12,10 +12,12 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import matplotlib.pyplot as plt
+import matplotlib
 import torch
+from matplotlib.figure import Figure
 from torch.distributions import Normal
 
+from torchrl_ecpo.experiment.figures import METHOD_COLOURS, NEUTRAL, STYLE, save_figure
 from torchrl_ecpo.functional import (
     centred_gaussian_projection,
     lifted_log_weights,
@@ -52,22 +54,26 @@ def scales(projection: str) -> list[float]:
     return history
 
 
+@matplotlib.rc_context(STYLE)
 def main() -> None:
     """Write the picture beside this file."""
-    figure, axes = plt.subplots(figsize=(6, 3.2), layout="constrained")
-    axes.plot(scales("paper"), label="Eq. 11 to the letter")
-    axes.plot(scales("centred"), label="centred scale")
+    figure = Figure(figsize=(7.6, 2.8), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(scales("paper"), color=METHOD_COLOURS["eq11"], label="Eq. 11 to the letter")
+    axes.plot(scales("centred"), color=METHOD_COLOURS["centredscale"], label="centred scale")
     axes.axhline(
-        math.sqrt(TAU_PRIME / 2), color="black", linestyle=":", label="fixed point of the lift"
+        math.sqrt(TAU_PRIME / 2), color=NEUTRAL, linestyle=":", label="fixed point of the lift"
     )
     axes.set(
         xlabel="lifts, one gradient step each",
         ylabel="standard deviation of the policy",
         yscale="log",
+        yticks=(0.2, 0.5, 1.0),
+        yticklabels=("0.2", "0.5", "1"),
     )
-    axes.legend(frameon=False)
-    plt.rcParams["svg.hashsalt"] = "torchrl_ecpo"
-    figure.savefig(Path(__file__).with_suffix(".svg"), metadata={"Date": None})
+    axes.minorticks_off()
+    figure.legend(loc="outside right center")
+    save_figure(figure, Path(__file__).with_suffix(".svg"))
 
 
 if __name__ == "__main__":

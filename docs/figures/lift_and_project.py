@@ -12,13 +12,21 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import matplotlib.pyplot as plt
+import matplotlib
 import torch
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap, to_rgb
 from matplotlib.figure import Figure
 from torch import Tensor
 from torch.distributions import Normal
 
+from torchrl_ecpo.experiment.figures import (
+    COLOURS,
+    METHOD_COLOURS,
+    NEUTRAL,
+    STYLE,
+    save_figure,
+)
 from torchrl_ecpo.functional import (
     lifted_log_weights,
     mean_seeking_projection,
@@ -35,7 +43,10 @@ REFERENCE = (-0.8, 1.2)  # mean and standard deviation
 TAU, TAU_PRIME = 0.25, 0.05
 NUM_LIFTS, NUM_STEPS, LEARNING_RATE = 30, 40, 0.02
 MEAN_SEEKING, MODE_SEEKING = "mean-seeking KL(target, policy)", "mode-seeking KL(policy, target)"
-COLOURS = {MEAN_SEEKING: "#0072B2", MODE_SEEKING: "#D55E00"}
+OF_PROJECTION = {
+    MEAN_SEEKING: METHOD_COLOURS["meanseeking"],
+    MODE_SEEKING: METHOD_COLOURS["modeseeking"],
+}
 FOLDER = Path(__file__).parent
 
 
@@ -69,13 +80,13 @@ def project(
     for _ in range(num_steps):
         log_prob = log_density(loc, log_scale.exp())
         if projection == MEAN_SEEKING:
-            loss, _ = mean_seeking_projection(log_prob, lift + reference - GRID_LOG_PROB)
+            surrogate = mean_seeking_projection(log_prob, lift + reference - GRID_LOG_PROB)
         else:
-            loss, _ = mode_seeking_projection(
+            surrogate = mode_seeking_projection(
                 log_prob, reference, lift, behaviour_log_prob=GRID_LOG_PROB
             )
         optimizer.zero_grad()
-        loss.backward()
+        surrogate.loss.backward()
         optimizer.step()
         path.append((loc.item(), log_scale.exp().item()))
     return path
@@ -84,24 +95,24 @@ def project(
 def draw_lift() -> Figure:
     """Targets of one reference policy at several temperatures."""
     reference = log_density(*REFERENCE)
-    figure, panels = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained", sharey=True)
+    figure = Figure(figsize=(7.6, 3.2), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
     settings = (
-        ("smaller tau: further from the reference", [(1.0, 0.0), (0.3, 0.0), (0.15, 0.0)]),
-        ("larger share of tau': the reference fades", [(0.3, 0.0), (0.15, 0.15), (0.0, 0.3)]),
+        ("smaller τ: further from the reference", [(1.0, 0.0), (0.3, 0.0), (0.15, 0.0)]),
+        ("larger share of τ\N{PRIME}: the reference fades", [(0.3, 0.0), (0.15, 0.15), (0.0, 0.3)]),
     )
+    colours, entries = iter(COLOURS), {}
     for panel, (title, temperatures) in zip(panels, settings, strict=True):
-        panel.fill_between(ACTIONS, REWARD, color="0.9", label="reward")
-        panel.plot(ACTIONS, reference.exp(), color="black", linestyle=":", label="reference")
-        for (tau, tau_prime), colour in zip(
-            temperatures, ("#56B4E9", "#0072B2", "#CC79A7"), strict=True
-        ):
-            label = f"target, tau {tau:g}, tau' {tau_prime:g}"
-            panel.plot(
-                ACTIONS, target_density(reference, tau, tau_prime), color=colour, label=label
-            )
-        panel.set(title=title, xlabel="action", ylim=(0, 1.7))
-        panel.legend(frameon=False, fontsize="small")
+        entries["reward"] = panel.fill_between(ACTIONS, REWARD, color=NEUTRAL, alpha=0.3, lw=0)
+        (entries["reference"],) = panel.plot(ACTIONS, reference.exp(), color=NEUTRAL, ls=":")
+        for tau, tau_prime in temperatures:
+            label = f"τ = {tau:g}, τ\N{PRIME} = {tau_prime:g}"
+            target = target_density(reference, tau, tau_prime)
+            colour = entries[label].get_color() if label in entries else next(colours)
+            (entries[label],) = panel.plot(ACTIONS, target, color=colour)
+        panel.set(title=title, xlabel="action", ylim=(0, 1.1))
     panels[0].set_ylabel("reward, or density")
+    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=4)
     return figure
 
 
@@ -109,19 +120,25 @@ def draw_projections() -> Figure:
     """Both divergences over the two parameters, and where gradient descent on them ends."""
     reference = log_density(*REFERENCE)
     target = target_density(reference, TAU, TAU_PRIME)
-    figure, panels = plt.subplots(1, 3, figsize=(12, 3.4), layout="constrained")
-    panels[0].fill_between(ACTIONS, target, color="0.85", label="target")
-    panels[0].plot(ACTIONS, reference.exp(), color="black", linestyle=":", label="reference")
-    for panel, projection in zip(panels[1:], COLOURS, strict=True):
+    figure = Figure(figsize=(7.6, 2.9), layout="constrained")
+    panels = figure.subplots(1, 3)
+    panels[0].fill_between(ACTIONS, target, color=NEUTRAL, alpha=0.4, lw=0, label="target")
+    panels[0].plot(ACTIONS, reference.exp(), color=NEUTRAL, linestyle=":", label="reference")
+    for panel, projection in zip(panels[1:], OF_PROJECTION, strict=True):
         path = project(REFERENCE, reference, projection, num_steps=400)
         draw_landscape(panel, target, projection, path)
         label = f"{projection.split()[0]} projection"
         panels[0].plot(
-            ACTIONS, log_density(*path[-1]).exp(), color=COLOURS[projection], label=label
+            ACTIONS, log_density(*path[-1]).exp(), color=OF_PROJECTION[projection], label=label
         )
     panels[0].set(xlabel="action", ylabel="density", ylim=(0, None))
-    panels[0].legend(frameon=False, fontsize="small")
+    figure.legend(loc="outside lower center", ncols=4)
     return figure
+
+
+def fading(colour: str) -> LinearSegmentedColormap:
+    """From nothing to a colour, which fits light and dark pages."""
+    return LinearSegmentedColormap.from_list(colour, [(*to_rgb(colour), a) for a in (0.0, 1.0)])
 
 
 def draw_landscape(
@@ -131,18 +148,19 @@ def draw_landscape(
     locs, scales = torch.linspace(-3.0, 3.5, 66), torch.linspace(0.25, 2.5, 46)
     log_policies = Normal(locs[:, None], scales[:, None, None]).log_prob(ACTIONS)
     heights = divergence_to(target, log_policies, projection)
-    panel.contourf(locs, scales, heights.clamp_max(4.0).sqrt(), levels=12, cmap="Greys")
+    panel.contourf(locs, scales, heights.clamp_max(4.0).sqrt(), levels=12, cmap=fading(NEUTRAL))
     means, deviations = zip(*path, strict=True)
-    panel.plot(means, deviations, color=COLOURS[projection])
-    panel.plot(means[0], deviations[0], "o", color="black", fillstyle="none")
-    panel.plot(means[-1], deviations[-1], "o", color=COLOURS[projection])
+    panel.plot(means, deviations, color=OF_PROJECTION[projection])
+    panel.plot(means[0], deviations[0], "o", color=NEUTRAL, fillstyle="none")
+    panel.plot(means[-1], deviations[-1], "o", color=OF_PROJECTION[projection])
     panel.set(title=projection, xlabel="mean", ylabel="standard deviation")
 
 
 def draw_iterations() -> Figure:
     """The policy over many lifts, each followed by a few gradient steps."""
-    figure, panels = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained", sharey=True)
-    for panel, projection in zip(panels, COLOURS, strict=True):
+    figure = Figure(figsize=(7.6, 2.6), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    for panel, projection in zip(panels, OF_PROJECTION, strict=True):
         policy, densities = REFERENCE, []
         for _ in range(NUM_LIFTS):
             reference = log_density(*policy)
@@ -152,27 +170,27 @@ def draw_iterations() -> Figure:
             torch.stack(densities, 1).sqrt(),
             origin="lower",
             aspect="auto",
-            cmap="Greys",
+            cmap=fading(OF_PROJECTION[projection]),
             vmax=1.0,
             extent=(0, NUM_LIFTS, ACTIONS[0].item(), ACTIONS[-1].item()),
         )
         for hill, name in ((-1.5, "low hill"), (2.0, "high hill")):
-            panel.axhline(hill, color=COLOURS[projection], linewidth=0.8, linestyle=":")
-            panel.text(NUM_LIFTS, hill + 0.4, name, ha="right", color=COLOURS[projection])
+            panel.axhline(hill, color=OF_PROJECTION[projection], linewidth=0.8, linestyle=":")
+            panel.text(NUM_LIFTS, hill + 0.6, name, ha="right", color=OF_PROJECTION[projection])
         panel.set(title=projection, xlabel="lifts")
     panels[0].set_ylabel("action")
     return figure
 
 
+@matplotlib.rc_context(STYLE)
 def main() -> None:
     """Write the pictures beside this file."""
-    plt.rcParams["svg.hashsalt"] = "torchrl_ecpo"
     for name, draw in (
         ("lift", draw_lift),
         ("projections", draw_projections),
         ("iterations", draw_iterations),
     ):
-        draw().savefig(FOLDER / f"{name}.svg", metadata={"Date": None})
+        save_figure(draw(), FOLDER / f"{name}.svg")
 
 
 if __name__ == "__main__":

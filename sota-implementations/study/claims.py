@@ -19,7 +19,7 @@ import scores
 from manifest import read_manifests
 from results import RESULTS, CellResult, read_cells
 
-from torchrl_ecpo.experiment.compare import Curve
+from torchrl_ecpo.experiment.compare import Curve, area, final
 
 REPORT = RESULTS.parents[1] / "docs" / "study.md"
 NUMBER = re.compile(r"(?<![\w@.])-?(?:\d{1,3}(?:,\d{3})+|\d+(?:\.\d+)?)")
@@ -122,7 +122,7 @@ def curve(path: str, metric: str = "") -> Curve:
 
 def ends(path: str, metric: str = "") -> np.ndarray:
     """The mean of each run over its last tenth, ``[runs]``."""
-    return scores.final(*curve(path, metric))
+    return final(*curve(path, metric))
 
 
 def by_end(path: str, metric: str = "") -> np.ndarray:
@@ -132,7 +132,7 @@ def by_end(path: str, metric: str = "") -> np.ndarray:
 
 def areas(path: str) -> np.ndarray:
     """The area under the curve of each run, over its length, ``[runs]``."""
-    return scores.area(*curve(path))
+    return area(*curve(path))
 
 
 def last(path: str, metric: str = "") -> np.ndarray:

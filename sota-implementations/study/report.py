@@ -7,35 +7,44 @@ from __future__ import annotations
 
 import statistics
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 from manifest import SCRIPTS, Manifest, Study, argument_parser, read_manifests
 from matplotlib.figure import Figure
 from results import RESULTS, CellResult, read_cells
 from scores import (
     Estimate,
-    area,
-    final,
     interquartile_means,
     probabilities_of_improvement,
     steps_to_solve,
 )
 
-from torchrl_ecpo.experiment.compare import Curve
-from torchrl_ecpo.experiment.figures import plot_comparison, save_figure
+from torchrl_ecpo.experiment.compare import Curve, area, final
+from torchrl_ecpo.experiment.figures import (
+    NEUTRAL,
+    STYLE,
+    plot_comparison,
+    save_figure,
+    symbols,
+)
 
 DOCS = SCRIPTS.parent / "docs"
 BEST = 3  # settings of a search that are listed
-FORMATS = (".svg", ".png")
+FEW_POINTS = 5  # fewer make no curve
 # Metrics as figures name them.
 METRIC_LABELS = {
     "expected_reward": "expected reward",
     "evaluation_return": "return",
     "ESS": "effective sample size",
     "distinct_solutions": "distinct solutions of a group",
+    "pass_at_1": "pass@1",
+    "pass_at_10": "pass@10",
+    "pass_at_k": "pass@k",
+    "long_attained": "attained at level 30",
 }
 SCORES = ("runs", "area", "final", "solved", "steps to solve")
 INTRODUCTION = """# The study
@@ -65,7 +74,8 @@ How to read the tables:
 - **steps to solve**: median over all runs; "> 240,000" if half of the runs or more never did.
 - **minutes a run**: of wall-clock time, also where a run went on after these steps; of runs in one
   process, a share.
-- Figures show the mean over runs and its standard error; the legend has the number of runs.
+- Figures show the mean over runs and, of two runs or more, its standard error. A task on which most
+  methods have one run, or fewer than five measurements, has rows in the tables and no panel.
 - Intervals are 95 % intervals of a stratified bootstrap, by
   [rliable](https://github.com/google-research/rliable). The interquartile mean (IQM) is the mean of
   the middle half of all runs on all tasks.
@@ -283,41 +293,53 @@ def groups_of(cells: Iterable[CellResult]) -> list[list[CellResult]]:
 
 
 def draw(name: str, docs: Path, picture: Callable[[Path], object], text: str) -> str:
-    """Draw a picture in each format; return the markdown that shows it."""
-    folder = docs / "figures" / "study"
-    folder.mkdir(parents=True, exist_ok=True)
-    for ending in FORMATS:
-        picture(folder / f"{name}{ending}")
-    return f"![{text}](figures/study/{name}.svg)"
+    """Draw a picture; return the markdown that shows it."""
+    path = Path("figures", "study", f"{name}.svg")
+    (docs / path).parent.mkdir(parents=True, exist_ok=True)
+    picture(docs / path)
+    return f"![{text}]({path})"
 
 
 def curves_figure(
     study: Study, cells: Sequence[CellResult], docs: Path, metric: str | None = None
 ) -> str:
-    """A panel for each task that has runs; of the task's own metric if none is named."""
+    """A panel for each task that has enough runs; of the task's own metric if none is named."""
     panels: dict[str, dict[str, Curve]] = {}
-    labels: dict[str, dict[str, str]] = {}
     for result in cells:
         curve = result.curve(metric) if metric else result.scored
         if curve is not None:
             panels.setdefault(result.title, {})[result.cell.method] = curve
-            label = f"{result.cell.method} ({result.count})"
-            labels.setdefault(result.title, {})[result.cell.method] = label
+    panels = {title: curves for title, curves in panels.items() if is_drawn(curves)}
     if not panels:
         return ""
     shown = [result for result in cells if result.title in panels]
-    metrics = dict.fromkeys(metric or result.cell.task.metric for result in shown)
+    tasks = {result.title: result.cell.task for result in shown}
+    levels = {
+        title: {
+            name: value
+            for name, value in (("solved", task.solved), ("best possible", task.best))
+            if value is not None and metric in (None, task.metric)
+        }
+        for title, task in tasks.items()
+    }
+    metrics = dict.fromkeys(metric or task.metric for task in tasks.values())
     y_label = " or ".join(METRIC_LABELS.get(name, name) for name in metrics)
     picture = partial(
         plot_comparison,
         panels,
-        labels=labels,
-        methods=list(study.methods),
         x_label=next(run["unit"] for result in shown for run in result.runs.values()),
         y_label=y_label,
+        levels=levels,
     )
     name = f"{study.name}_{metric}" if metric else study.name
     return draw(name, docs, picture, f"{study.title}: {y_label}")
+
+
+def is_drawn(curves: Mapping[str, Curve]) -> bool:
+    """Whether a task has enough for a panel: half of the methods several runs, and no few dots."""
+    several = [len(values) > 1 for _, values in curves.values()]
+    points = [len(steps) for steps, _ in curves.values()]
+    return sum(several) >= len(several) / 2 and min(points) >= FEW_POINTS
 
 
 def heat_maps(study: Study, cells: Sequence[CellResult], docs: Path) -> str:
@@ -330,6 +352,7 @@ def heat_maps(study: Study, cells: Sequence[CellResult], docs: Path) -> str:
     )
 
 
+@matplotlib.rc_context(STYLE)
 def plot_heat_map(
     values: np.ndarray,
     path: Path,
@@ -337,7 +360,6 @@ def plot_heat_map(
     title: str,
     x_axis: tuple[str, Sequence[str]],
     y_axis: tuple[str, Sequence[str]],
-    texts: np.ndarray,
 ) -> Path:
     """Draw a number for each pair of settings; return ``path``.
 
@@ -347,27 +369,20 @@ def plot_heat_map(
         title: of the picture.
         x_axis: name and settings of the columns.
         y_axis: name and settings of the rows.
-        texts: ``[y, x]``, what is written in each field.
     """
-    figure = Figure(figsize=(1.6 + 1.1 * len(x_axis[1]), 1.4 + 0.8 * len(y_axis[1])))
-    figure.set_layout_engine("constrained")
+    size = (1.2 + 1.1 * len(x_axis[1]), 0.9 + 0.5 * len(y_axis[1]))
+    figure = Figure(figsize=size, layout="constrained")
     panel = figure.subplots()
-    image = panel.imshow(values, origin="lower", aspect="auto", cmap="viridis")
+    panel.imshow(values, origin="lower", aspect="auto", cmap="viridis")
     panel.set_xticks(range(len(x_axis[1])), x_axis[1])
     panel.set_yticks(range(len(y_axis[1])), y_axis[1])
-    panel.set(xlabel=x_axis[0], ylabel=y_axis[0], title=title)
+    panel.set(xlabel=symbols(x_axis[0]), ylabel=symbols(y_axis[0]), title=title)
+    panel.spines[:].set_visible(False)
     brightest_with_white = np.nanmin(values) + 0.6 * np.ptp(values[np.isfinite(values)])
     for (row, column), value in np.ndenumerate(values):
-        panel.text(
-            column,
-            row,
-            str(texts[row, column]),
-            ha="center",
-            va="center",
-            # On the bright end of the scale, and on the white of what is missing.
-            color="white" if value < brightest_with_white else "black",
-        )
-    figure.colorbar(image, ax=panel)
+        color = NEUTRAL if np.isnan(value) else "w" if value < brightest_with_white else "k"
+        text = "not run" if np.isnan(value) else f"{value:.1f}"
+        panel.text(column, row, text, ha="center", va="center", color=color)
     return save_figure(figure, path)
 
 
@@ -381,18 +396,13 @@ def heat_map(study: Study, group: Sequence[CellResult], docs: Path, metric: str)
     shape = tuple(len(values) for _, values in axes)
     curves = [result.curve(metric) for result in group]
     means = [np.nan if curve is None else final(*curve).mean() for curve in curves]
-    texts = [
-        f"{mean:.1f}\n({result.count})" if result.runs else "not run"
-        for mean, result in zip(means, group, strict=True)
-    ]
     label = METRIC_LABELS.get(metric, metric)
     picture = partial(
         plot_heat_map,
         np.reshape(means, shape),
-        title=f"{method} on {group[0].title}: final {label} (runs)",
+        title=f"{method} on {group[0].title}: final {label}",
         y_axis=axes[0],
         x_axis=axes[1],
-        texts=np.reshape(texts, shape),
     )
     suffix = "" if metric == task.metric else f"_{metric}"
     name = f"{study.name}_{task.name}_{method.lower()}{suffix}"

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from manifest import SCRIPTS, Cell, Manifest, Study, changed_entries
 from records import Record
-from scores import final
 
-from torchrl_ecpo.experiment.compare import Curve, align
+from torchrl_ecpo.experiment.compare import Curve, align, final
 
 RESULTS = SCRIPTS / "results"
 # Of a curve: each is the mean over a hundredth of the run.

@@ -20,33 +20,6 @@ class Estimate(NamedTuple):
     high: float
 
 
-def area(steps: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Area under the curve over the length of the run: the mean of the metric, ``[runs]``.
-
-    Args:
-        steps: ``[n]``.
-        values: ``[runs, n]``, joined by straight lines.
-
-    Examples:
-        >>> area(np.array([0, 10, 40]), np.array([[0.0, 2.0, 4.0]])).tolist()
-        [2.5]
-    """
-    if len(steps) == 1:
-        return values[:, 0]
-    means = (values[:, 1:] + values[:, :-1]) / 2
-    return means @ np.diff(steps) / (steps[-1] - steps[0])
-
-
-def final(steps: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Mean of the metric over the last tenth of the steps, ``[runs]``.
-
-    Examples:
-        >>> final(np.array([10, 90, 95, 100]), np.array([[0.0, 1.0, 2.0, 4.0]])).tolist()
-        [3.0]
-    """
-    return values[:, steps > 0.9 * steps[-1]].mean(axis=1)
-
-
 def steps_to_solve(steps: np.ndarray, values: np.ndarray, threshold: float) -> np.ndarray:
     """The step at which the metric first is at the threshold or above; infinite if never.
 

@@ -78,7 +78,7 @@ SUBJECTS = {
     "load_comparison": Subject(
         compare,
         {"metric": "return", "smoothing": 0.5},
-        optional=["smoothing"],
+        optional=["metric", "smoothing"],
     ),
     "smooth": Subject(smoothed, {"fraction": 0.5}, optional=["fraction"]),
     "compile_module": Subject(compiled, {"module": torch.nn.Linear(1, 1)}),

@@ -1,6 +1,6 @@
 """Compare runs: a table and a picture with a curve for each method.
 
-``python -m torchrl_ecpo.experiment.compare RUN_DIRECTORY... --metric expected_reward``
+``python -m torchrl_ecpo.experiment.compare RUN_DIRECTORY...``
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ from torchrl_ecpo.checks import as_float
 from torchrl_ecpo.experiment.figures import plot_comparison, smooth
 from torchrl_ecpo.experiment.run import METRICS_FILE, read_metrics
 
-__all__ = ["Comparison", "align", "find_runs", "load_comparison", "main"]
+__all__ = ["Comparison", "align", "area", "final", "find_runs", "load_comparison", "main"]
 
+DEFAULT_METRICS = ("evaluation_return", "expected_reward", "return")
 Curve = tuple[np.ndarray, np.ndarray]
 """Steps ``[n]`` and values ``[runs, n]``."""
 
@@ -45,17 +46,60 @@ class Comparison:
         return path
 
     def table(self) -> str:
-        """Final value of each method as a markdown table: mean, standard error, worst, runs."""
-        lines = [f"| method | runs | steps | {self.metric} | worst |", "|---|---|---|---|---|"]
-        for method, (steps, values) in self.curves.items():
-            final = values[:, -1]
-            error = final.std(ddof=1) / np.sqrt(len(final)) if len(final) > 1 else np.nan
-            spread = "" if np.isnan(error) else f" ± {error:.3f}"
+        """Scores of each method as a markdown table, the best first.
+
+        Methods are ranked by the mean of the metric over the run (:func:`area`). Beside it are the
+        mean of its last tenth (:func:`final`), both with standard error over runs, and the worst
+        run's.
+        """
+        lines = [
+            f"| method | runs | steps | mean {self.metric} | final {self.metric} | worst |",
+            "|---|---|---|---|---|---|",
+        ]
+        for method in sorted(self.curves, key=lambda method: -area(*self.curves[method]).mean()):
+            steps, values = self.curves[method]
+            means, ends = area(steps, values), final(steps, values)
             lines.append(
-                f"| {method} | {len(final)} | {int(steps[-1]):,} | {final.mean():.3f}{spread} "
-                f"| {final.min():.3f} |"
+                f"| {method} | {len(ends)} | {int(steps[-1]):,} | {_with_error(means)} "
+                f"| {_with_error(ends)} | {ends.min():.3f} |"
             )
         return "\n".join(lines)
+
+
+def area(steps: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Area under the curve over the length of the run: the mean of the metric, ``[runs]``.
+
+    Args:
+        steps: ``[n]``.
+        values: ``[runs, n]``, joined by straight lines.
+
+    Examples:
+        >>> area(np.array([0, 10, 40]), np.array([[0.0, 2.0, 4.0]])).tolist()
+        [2.5]
+    """
+    if len(steps) == 1:
+        return values[:, 0]
+    means = (values[:, 1:] + values[:, :-1]) / 2
+    return means @ np.diff(steps) / (steps[-1] - steps[0])
+
+
+def final(steps: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Mean of the metric over the last tenth of the steps, ``[runs]``.
+
+    Args:
+        steps: ``[n]``.
+        values: ``[runs, n]``.
+
+    Examples:
+        >>> final(np.array([10, 90, 95, 100]), np.array([[0.0, 1.0, 2.0, 4.0]])).tolist()
+        [3.0]
+    """
+    return values[:, steps > 0.9 * steps[-1]].mean(axis=1)
+
+
+def _with_error(values: np.ndarray) -> str:
+    error = f" ± {values.std(ddof=1) / np.sqrt(len(values)):.3f}" if len(values) > 1 else ""
+    return f"{values.mean():.3f}{error}"
 
 
 def find_runs(directories: Sequence[Path]) -> list[Path]:
@@ -73,7 +117,7 @@ def find_runs(directories: Sequence[Path]) -> list[Path]:
 
 def load_comparison(
     runs: Sequence[Path],
-    metric: str,
+    metric: str | None = None,
     *,
     by: Sequence[str] = ("loss.name",),
     smoothing: float = 0.0,
@@ -82,7 +126,8 @@ def load_comparison(
 
     Args:
         runs: directories of runs.
-        metric: the column to compare.
+        metric: the column to compare; None: the first of ``evaluation_return``,
+            ``expected_reward`` and ``return`` that the first run has.
         by: the entries of ``config.yaml`` that tell methods apart.
         smoothing: length of the trailing window over which values are averaged, as a fraction of
             the run; by default they are taken as measured.
@@ -92,6 +137,9 @@ def load_comparison(
         ValueError: if a run has no value yet, or the runs of a method do not overlap.
     """
     smoothing = as_float("smoothing", smoothing)
+    if metric is None:
+        measured = read_metrics(runs[0])
+        metric = next((name for name in DEFAULT_METRICS if name in measured), DEFAULT_METRICS[-1])
     curves: dict[str, list[np.ndarray]] = {}
     for run in runs:
         columns = read_metrics(run)
@@ -146,6 +194,12 @@ def _method(run: Path, by: Sequence[str]) -> str:
     return ", ".join([first, *(f"{e} {v}" for e, v in zip(by[1:], others, strict=True))])
 
 
+def _unit(run: Path) -> str:
+    """What a step is: the length of a run is ``total_trajectories``, ``total_frames``, ..."""
+    names = map(str, OmegaConf.load(run / "config.yaml"))
+    return next((n.removeprefix("total_") for n in names if n.startswith("total_")), "steps")
+
+
 def _is_unfinished(run: Path) -> bool:
     summary = run / "summary.json"  # which a run that was killed has not written
     return not summary.is_file() or not json.loads(summary.read_text())["finished"]
@@ -155,13 +209,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table of a comparison, and where its picture is."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("directories", nargs="+", type=Path, help="runs, or folders of runs")
-    parser.add_argument("--metric", required=True, help="column of metrics.csv to compare")
+    parser.add_argument(
+        "--metric",
+        help="column of metrics.csv; by default the first that the first run has of "
+        + ", ".join(DEFAULT_METRICS),
+    )
     parser.add_argument(
         "--by", nargs="+", default=["loss.name"], help="config entries that tell methods apart"
     )
     parser.add_argument("--smoothing", type=float, default=0.0, help="as a fraction of the run")
     parser.add_argument("--title", default="")
-    parser.add_argument("--x-label", default="trajectories")
+    parser.add_argument("--x-label", help="by default what a step of the first run is")
     parser.add_argument("--output", type=Path, help="picture; by default beside the runs")
     parser.add_argument("--csv", type=Path, help="also write the curves as a csv table")
     options = parser.parse_args(arguments)
@@ -172,15 +230,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"not finished, and curves are as long as the shortest one: {run}")
     if options.csv is not None:
         print(f"curves: {comparison.write(options.csv).resolve()}")
-    curves = comparison.curves
-    labels = {method: f"{method} ({len(values)} runs)" for method, (_, values) in curves.items()}
     picture = plot_comparison(
-        {options.title: curves},
+        {options.title: comparison.curves},
         options.output or options.directories[0] / "comparison.png",
-        labels={options.title: labels},
-        methods=list(curves),
-        x_label=options.x_label,
-        y_label=options.metric,
+        x_label=options.x_label or _unit(runs[0]),
+        y_label=comparison.metric,
     )
     print(f"picture: {picture.resolve()}")
 

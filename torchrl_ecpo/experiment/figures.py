@@ -1,39 +1,74 @@
-"""Learning curves as pictures."""
+"""Learning curves as pictures, which are read on light and on dark pages."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 
 from torchrl_ecpo.checks import as_fraction
 
 __all__ = [
+    "COLOURS",
+    "METHOD_COLOURS",
+    "NEUTRAL",
+    "STYLE",
+    "colours_of",
     "draw_curve",
     "plot_comparison",
     "plot_learning_curve",
     "save_figure",
     "smooth",
+    "symbols",
 ]
 
-# Okabe and Ito's palette, told apart by colour-blind readers too. A method of the paper's figures
-# has its colour in every picture.
-METHOD_COLOURS = {
-    "ecpo": "#0072B2",
-    "urex": "#009E73",
-    "ment": "#D55E00",
-    "ecac": "#0072B2",
-    "sac": "#009E73",
-    "td3": "#D55E00",
-    "ddpg": "#CC79A7",
+NEUTRAL = "#7a7a7a"
+"""Of text and axes: its contrast is the same, 4.3, to white and to a dark page."""
+WIDTH = 7.6  # inches, at most, which is what a page of text has: pictures are not scaled
+STYLE: dict[str, Any] = {
+    "axes.edgecolor": NEUTRAL,
+    "axes.labelcolor": NEUTRAL,
+    "axes.titlesize": "medium",
+    "figure.titlesize": "medium",
+    "font.size": 9,
+    "legend.frameon": False,
+    "savefig.transparent": True,
+    "svg.fonttype": "none",  # text stays text
+    "svg.hashsalt": "torchrl_ecpo",  # no random names
+    "text.color": NEUTRAL,
+    "xtick.color": NEUTRAL,
+    "ytick.color": NEUTRAL,
 }
-COLOURS = ("#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999", "#0072B2", "#009E73", "#D55E00")
+"""Settings of matplotlib, for ``matplotlib.rc_context``."""
+
+# After Okabe and Ito, told apart by colour-blind readers and on either page.
+BLUE, GREEN, RED, PINK = "#0072B2", "#009E73", "#D55E00", "#CC79A7"
+ORANGE, SKY, PURPLE, BROWN = "#E69F00", "#56B4E9", "#7B5FD0", "#9C6240"
+COLOURS = (BLUE, GREEN, RED, PINK, ORANGE, SKY, PURPLE, BROWN)
+METHOD_COLOURS = {
+    **dict.fromkeys(("ecpo", "ecac", "centred", "centredscale", "meanseeking"), BLUE),
+    **dict.fromkeys(("urex", "sac", "noprojection", "referencekept"), GREEN),
+    **dict.fromkeys(("ment", "td3", "tau0"), RED),
+    **dict.fromkeys(("tpo", "ddpg", "plainreturns", "eq11"), PINK),
+    **dict.fromkeys(("drgrpo", "grpo", "freshbatches", "k5andm5"), ORANGE),
+    **dict.fromkeys(("pmdentropy", "pmdacentropy", "smallstartat1e3"), ORANGE),
+    **dict.fromkeys(("reps", "tables", "aselsewhereat3e4"), SKY),
+    **dict.fromkeys(("pmd", "pmdac", "squaredpmd", "kimispmd", "modeseeking"), PURPLE),
+    **dict.fromkeys(("nocontrolvariate", "tau02", "lr003", "k5andm2"), PURPLE),
+    **dict.fromkeys(("repsentropy", "lstm", "aselsewhereat1e3"), BROWN),
+    "smallstartat3e4": BLUE,
+}
+"""Of a method, by the letters and digits of its name: the same in every picture."""
+
 Curves = Mapping[str, tuple[np.ndarray, np.ndarray]]
 """By method, the steps ``[n]`` and the values ``[runs, n]``."""
 
@@ -60,6 +95,7 @@ def smooth(values: np.ndarray, fraction: float = 0.02) -> np.ndarray:
     return (sums[ends] - sums[starts]) / (ends - starts)
 
 
+@matplotlib.rc_context(STYLE)
 def plot_learning_curve(
     rows: Sequence[Mapping[str, float]],
     path: Path,
@@ -67,88 +103,139 @@ def plot_learning_curve(
     metrics: Sequence[str],
     title: str,
     x_label: str,
-) -> Path:
-    """Draw the record of one run, a panel for each metric that it has; return ``path``."""
-    present = [metric for metric in metrics if any(metric in row for row in rows)]
-    figure = Figure(figsize=(4.2 * max(len(present), 1), 3.2), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(1, max(len(present), 1)))
-    for panel, metric in zip(panels, present, strict=False):
-        measured = [(row["step"], row[metric]) for row in rows if metric in row]
-        steps, values = np.array(measured, dtype=float).T
-        panel.plot(steps, values, color=METHOD_COLOURS["ecpo"], alpha=0.25, linewidth=1)
-        panel.plot(steps, smooth(values), color=METHOD_COLOURS["ecpo"])
-        panel.set_ylabel(metric)
-        _decorate(panel, x_label)
+) -> Path | None:
+    """Draw the record of one run, a panel for each metric that was measured.
+
+    Args:
+        rows: of the record; each has ``step``.
+        path: of the picture; its ending is its format.
+        metrics: those to draw.
+        title: of the picture.
+        x_label: what a step is.
+
+    Returns:
+        ``path``, or None if none of the metrics was measured: there is no picture then.
+    """
+    curves = {
+        metric: [(row["step"], row[metric]) for row in rows if np.isfinite(row.get(metric, np.nan))]
+        for metric in metrics
+    }
+    curves = {metric: points for metric, points in curves.items() if points}
+    if not curves:
+        return None
+    figure, panels, _ = _grid(len(curves), x_label, columns=min(len(curves), 3))
+    for panel, (metric, points) in zip(panels, curves.items(), strict=True):
+        steps, values = np.array(points, dtype=float).T
+        panel.plot(steps, values, color=BLUE, alpha=0.3, linewidth=1)
+        marker = "." if len(steps) < 10 else None
+        panel.plot(steps, smooth(values), color=BLUE, marker=marker)
+        panel.set_title(metric)
     figure.suptitle(title)
-    figure.savefig(path, dpi=120)
-    return path
+    return save_figure(figure, path)
 
 
+@matplotlib.rc_context(STYLE)
 def plot_comparison(
     panels: Mapping[str, Curves],
     path: Path,
     *,
-    labels: Mapping[str, Mapping[str, str]],
-    methods: Sequence[str],
     x_label: str,
     y_label: str,
+    levels: Mapping[str, Mapping[str, float]] | None = None,
 ) -> Path:
     """Draw mean and standard error of several runs of each method; return ``path``.
 
     Args:
-        panels: by title, the curves of a task.
+        panels: by title, the curves of a task. Colours are those of the methods'
+            :data:`METHOD_COLOURS`, in every panel the same.
         path: of the picture; its ending is its format.
-        labels: by title and method, what the legend says.
-        methods: all that are compared, so that each has its colour in every panel.
         x_label: what a step is.
         y_label: what a value is.
+        levels: by title and name, values that a line marks, such as where a task is solved.
     """
-    columns = min(len(panels), 3)
-    rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(4.0 * columns, 3.2 * rows), layout="constrained")
-    axes = np.atleast_1d(figure.subplots(rows, columns)).flatten()
-    colours = _colours(methods)
-    for panel, (title, curves) in zip(axes, panels.items(), strict=False):
-        for method, curve in curves.items():
-            draw_curve(panel, *curve, color=colours[method], label=labels[title][method])
-        panel.legend(frameon=False, fontsize="small")
+    columns = {1: 1, 2: 2, 4: 2}.get(len(panels), 3)
+    figure, axes, spare = _grid(len(panels), x_label, columns)
+    methods = dict.fromkeys(method for curves in panels.values() for method in curves)
+    colours = colours_of(methods)
+    names = dict.fromkeys(name for marked in (levels or {}).values() for name in marked)
+    dashes = dict(zip(names, itertools.cycle(((0, (4, 3)), (0, (1, 2))))))
+    entries = {}  # of the legend
+    for panel, (title, curves) in zip(axes, panels.items(), strict=True):
+        for name, value in (levels or {}).get(title, {}).items():
+            entries[name] = panel.axhline(value, color=NEUTRAL, linewidth=1, linestyle=dashes[name])
+        for method in reversed(curves):  # the first is on top
+            entries[method] = draw_curve(
+                panel, *curves[method], color=colours[method], label=symbols(method)
+            )
         panel.set_title(title)
-        panel.xaxis.set_major_formatter(EngFormatter(sep=""))
-        _decorate(panel, x_label)
-    for panel in axes[::columns]:
-        panel.set_ylabel(y_label)
-    for panel in axes[len(panels) :]:
-        panel.set_visible(False)
+    figure.supylabel(y_label, fontsize="medium")
+    legend = {symbols(name): entries[name] for name in (*methods, *names)}
+    if spare is not None:
+        spare.legend(legend.values(), legend.keys(), loc="center")
+    elif columns == 1:
+        figure.legend(legend.values(), legend.keys(), loc="outside right center")
+    else:
+        figure.set_figheight(figure.get_figheight() + 0.2 * -(-len(legend) // 5))
+        figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=5)
     return save_figure(figure, path)
+
+
+def _grid(count: int, x_label: str, columns: int) -> tuple[Figure, list[Axes], Axes | None]:
+    """A figure, that many panels, and an empty place for a legend if one is left."""
+    rows = -(-count // columns)
+    figure = Figure(figsize=(WIDTH, 0.3 + 2.1 * rows), layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False).flatten())
+    for panel in axes[:count]:
+        panel.grid(color=NEUTRAL, alpha=0.25, linewidth=0.6)
+        panel.spines[["top", "right"]].set_visible(False)
+        panel.xaxis.set_major_formatter(EngFormatter(sep=""))
+    for panel in axes[:count][-columns:]:
+        panel.set_xlabel(x_label)
+    for panel in axes[count:]:
+        panel.set_axis_off()
+    return figure, axes[:count], axes[count] if count < len(axes) else None
 
 
 def draw_curve(
     panel: Axes, steps: np.ndarray, values: np.ndarray, *, color: str, label: str
-) -> None:
-    """Draw the mean over runs ``[runs, n]`` and, of two or more, a band of its standard error."""
+) -> Line2D:
+    """Draw the mean over runs ``[runs, n]`` and, of two or more, a band of its standard error.
+
+    Returns:
+        The line, for a legend.
+    """
     mean, runs = values.mean(axis=0), len(values)
     marker = "o" if len(steps) == 1 else None  # a line needs two points
-    panel.plot(steps, mean, color=color, label=label, marker=marker)
+    (line,) = panel.plot(steps, mean, color=color, label=label, marker=marker)
     if runs > 1:
         error = values.std(axis=0, ddof=1) / np.sqrt(runs)
         panel.fill_between(steps, mean - error, mean + error, color=color, alpha=0.2, lw=0)
+    return line
 
 
-def _colours(methods: Collection[str]) -> dict[str, str]:
-    """A colour for each method: its own, or else the next that is free, as long as there are."""
-    taken = {METHOD_COLOURS.get(method.lower()) for method in methods}
-    others = itertools.cycle([c for c in COLOURS if c not in taken] or COLOURS)
-    return {method: METHOD_COLOURS.get(method.lower()) or next(others) for method in methods}
+def colours_of(methods: Iterable[str]) -> dict[str, str]:
+    """A colour for each method: its own, or else the next that is free, as long as there are.
+
+    Examples:
+        >>> colours_of(["PMD+entropy", "mine"])
+        {'PMD+entropy': '#E69F00', 'mine': '#0072B2'}
+    """
+    own = {m: METHOD_COLOURS.get("".join(filter(str.isalnum, m.lower()))) for m in methods}
+    others = itertools.cycle([c for c in COLOURS if c not in own.values()] or COLOURS)
+    return {method: colour or next(others) for method, colour in own.items()}
+
+
+def symbols(text: str) -> str:
+    """The text with the temperatures as letters.
+
+    Examples:
+        >>> symbols("tau' = 0, tau = 1")
+        'τ′ = 0, τ = 1'
+    """
+    return re.sub(r"\btau\b", "τ", text).replace("τ'", "τ\N{PRIME}")
 
 
 def save_figure(figure: Figure, path: Path) -> Path:
-    """Write a picture that depends on what it shows alone: no date, no random names."""
-    with matplotlib.rc_context({"svg.hashsalt": "torchrl_ecpo"}):
-        figure.savefig(path, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
+    """Write a picture that depends on what it shows alone, without the date; return ``path``."""
+    figure.savefig(path, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
     return path
-
-
-def _decorate(panel: Axes, x_label: str) -> None:
-    panel.set_xlabel(x_label)
-    panel.grid(alpha=0.3)
-    panel.spines[["top", "right"]].set_visible(False)

@@ -187,8 +187,8 @@ class Run:
     """A training run in the current directory: record, loggers, progress bar, picture.
 
     Writes ``config.yaml``, ``versions.json``, ``metrics.csv`` as it goes, and at the end
-    ``summary.json`` and ``curve.png``. Use it as a context manager; a run that is interrupted keeps
-    its record and still draws its picture.
+    ``summary.json`` and ``curve.png``, if any of ``shown`` was measured. Use it as a context
+    manager; a run that is interrupted keeps its record and still draws its picture.
 
     Args:
         config: the composed configuration; needs ``seed`` and ``logger`` with ``backend``
@@ -339,7 +339,8 @@ class Run:
             title=self.name,
             x_label=self.unit,
         )
-        print(f"{self.name}: learning curve in {picture}")
+        if picture is not None:
+            print(f"{self.name}: learning curve in {picture}")
 
 
 def flatten(config: object, prefix: str = "") -> dict[str, float | str]:
