@@ -16,23 +16,38 @@ from sphinx.util import inspect
 warnings.filterwarnings("ignore", ".*inherits from WeightUpdaterBase.*", DeprecationWarning)
 
 project = "torchrl_ecpo"
-author = "the authors of torchrl_ecpo"
+author = "the torchrl_ecpo authors"
 version = release = installed_version("torchrl-ecpo")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.napoleon"]
+copyright = "2026 " + author
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_copybutton",
+    "sphinx-mathjax-offline",
+]
 exclude_patterns = ["_build"]
 html_theme = "furo"
-html_title = project
+html_title = f"{project} {version}"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+copybutton_exclude = ".linenos, .gp, .go"
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = (
     4  # links like searches.md#the-search-behind-the-first-study, as GitHub has them
 )
 
+autodoc_typehints_format = "short"
 autodoc_default_options = {"members": True, "member-order": "bysource", "show-inheritance": True}
 add_module_names = False
 default_role = "code"  # what stands in single backquotes
 python_use_unqualified_type_names = True
+python_display_short_literal_types = True
 python_maximum_signature_line_length = 88
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
@@ -70,7 +85,10 @@ def signature_of_init(
     if what != "class" or signature != "(*args, **kwargs)":
         return None
     arguments = inspect.signature(found.__init__, bound_method=True)
-    return inspect.stringify_signature(arguments, show_return_annotation=False), returns
+    text = inspect.stringify_signature(
+        arguments, show_return_annotation=False, unqualified_typehints=True
+    )
+    return text, returns
 
 
 def setup(app: Sphinx) -> None:

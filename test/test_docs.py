@@ -173,6 +173,16 @@ def test_commands_compose(page):
             compose_command(script, options)
 
 
+@pytest.mark.slow
+def test_the_pictures_of_the_pages_can_be_drawn(tmp_path):
+    for script in sorted((DOCS / "figures").glob("*.py")):
+        (tmp_path / script.name).write_text(script.read_text())
+        process = run_script(tmp_path, tmp_path / script.name)
+        assert process.returncode == 0, process.stderr
+    drawn, shown = ({file.name for file in f.glob("*.svg")} for f in (tmp_path, DOCS / "figures"))
+    assert drawn == shown
+
+
 @pytest.mark.parametrize("page", PAGES_WITH_DEFAULTS, ids=name)
 def test_stated_defaults_are_those_of_the_configuration(page):
     tables = DEFAULTS_TABLE.findall(page.read_text())

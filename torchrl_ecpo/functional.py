@@ -98,6 +98,11 @@ class Surrogate(NamedTuple):
     """What a member of the family returns: a loss, the weights behind it, and what else it found.
 
     Only ``loss`` and ``weights`` come from the functions of this module.
+
+    Examples:
+        >>> surrogate = mean_seeking_projection(torch.zeros(2, 4), torch.zeros(2, 4))
+        >>> surrogate.loss.shape, surrogate.weights[0].tolist()
+        (torch.Size([2]), [0.25, 0.25, 0.25, 0.25])
     """
 
     loss: Tensor

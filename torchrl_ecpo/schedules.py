@@ -29,6 +29,7 @@ __all__ = [
 ]
 
 Schedule = Callable[[float], float]
+"""A temperature by the count."""
 
 
 def constant(value: float) -> Schedule:

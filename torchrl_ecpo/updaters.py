@@ -179,6 +179,17 @@ class PeriodicCopy(_NetworkUpdater):
         TypeError: if ``loss_module`` is no LossModule.
         ValueError: if a network is unknown, not delayed or named twice, or if
             ``interval`` is not a positive int.
+
+    Examples:
+        >>> from torchrl_ecpo import ECPOLoss
+        >>> from torchrl_ecpo.envs import BanditEnv
+        >>> from torchrl_ecpo.modules import make_softmax_policy
+        >>> actor = make_softmax_policy(BanditEnv(num_actions=6).features)
+        >>> loss_module = ECPOLoss(actor, delay_actor=True)
+        >>> updater = PeriodicCopy(loss_module, "actor_network", interval=100)
+        >>> updater.step()
+        >>> updater.counter
+        1
     """
 
     option = "interval"
@@ -226,6 +237,15 @@ class PolyakAverage(_NetworkUpdater):
         TypeError: if ``loss_module`` is no LossModule.
         ValueError: if a network is unknown, not delayed or named twice, or if
             ``weight`` is not in (0, 1].
+
+    Examples:
+        >>> from torchrl_ecpo import ECPOLoss
+        >>> from torchrl_ecpo.envs import BanditEnv
+        >>> from torchrl_ecpo.modules import make_softmax_policy
+        >>> actor = make_softmax_policy(BanditEnv(num_actions=6).features)
+        >>> loss_module = ECPOLoss(actor, delay_actor=True)
+        >>> updater = PolyakAverage(loss_module, "actor_network", weight=0.01)
+        >>> updater.step()
     """
 
     option = "weight"
@@ -299,6 +319,15 @@ class UpdaterSequence(TargetNetUpdater):
     Raises:
         ValueError: if there are no updaters, if one of them is no TargetNetUpdater, if they belong
             to different losses, or if two of them update the same network.
+
+    Examples:
+        >>> from torchrl_ecpo import ECPOLoss
+        >>> from torchrl_ecpo.envs import BanditEnv
+        >>> from torchrl_ecpo.modules import make_softmax_policy
+        >>> actor = make_softmax_policy(BanditEnv(num_actions=6).features)
+        >>> loss_module = ECPOLoss(actor, delay_actor=True)
+        >>> UpdaterSequence(PeriodicCopy(loss_module, "actor_network", interval=100)).networks
+        ('actor_network',)
     """
 
     def __init__(self, *updaters: TargetNetUpdater) -> None:

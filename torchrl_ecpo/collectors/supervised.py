@@ -45,6 +45,14 @@ class SupervisedSyncCollector(PlayerCollector):
         TypeError: if `create_env_fn` is no sequence of functions, or `policy` no function.
         ValueError: for numbers of frames that are none.
         ChildProcessError: if a worker dies.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> makers = [lambda: GymEnv("Pendulum-v1")] * 2
+        >>> collector = SupervisedSyncCollector(makers, frames_per_batch=8)  # doctest: +SKIP
+        >>> with shut_down(collector):  # doctest: +SKIP
+        ...     next(iter(collector)).numel()
+        8
     """
 
     _sync = True
@@ -86,6 +94,17 @@ class SupervisedAsyncCollector(SupervisedSyncCollector):
     """The same, but each batch is one worker's, while the others go on.
 
     As TorchRL's ``MultiAsyncCollector``: a batch may come from weights before the last update.
+
+    Raises:
+        ValueError: as :class:`SupervisedSyncCollector`.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> makers = [lambda: GymEnv("Pendulum-v1")] * 2
+        >>> collector = SupervisedAsyncCollector(makers, frames_per_batch=8)  # doctest: +SKIP
+        >>> with shut_down(collector):  # doctest: +SKIP
+        ...     next(iter(collector)).numel()
+        8
     """
 
     _sync = False

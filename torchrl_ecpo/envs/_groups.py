@@ -28,6 +28,9 @@ class GroupIdAllocator:
     a thousand allocators share a prefix with a probability of about one in a million. The
     prefix comes from the operating system, so that no seeded generator is touched.
 
+    Raises:
+        ValueError: by :meth:`allocate` and :meth:`identify`, for what is no count or too many.
+
     Examples:
         >>> ids = GroupIdAllocator().allocate(3)
         >>> ids.dtype, (ids - ids[0]).tolist()

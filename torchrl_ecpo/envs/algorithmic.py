@@ -82,6 +82,10 @@ class AlgorithmicTask:
         last: successes in a row that raise `min_length` by one.
         threshold: an episode succeeds if its return minus the target's length is at least this.
         duplication: each character stands so many times in a row on the tape.
+
+    Examples:
+        >>> TASKS["reverse"].base, TASKS["reverse"].min_length
+        (2, 1)
     """
 
     base: int

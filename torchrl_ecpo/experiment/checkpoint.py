@@ -73,6 +73,14 @@ class Checkpoints:
     Raises:
         CheckpointError: if there is nothing to resume from, if the last checkpoint is damaged or
             not of such a run, or if the configuration is not the checkpoint's.
+
+    Examples:
+        >>> import tempfile
+        >>> options = {"interval": None, "max_share": 0.1, "keep": 2}
+        >>> config = OmegaConf.create({"resume": None, "checkpoint": options})
+        >>> checkpoints = Checkpoints(config, tempfile.mkdtemp())
+        >>> checkpoints.source is None  # there is nothing to go on from
+        True
     """
 
     def __init__(self, config: DictConfig, directory: Path | str = ".") -> None:

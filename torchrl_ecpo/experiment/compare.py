@@ -28,7 +28,14 @@ Curve = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Comparison:
-    """Runs of several methods on one task, on common steps."""
+    """Runs of several methods on one task, on common steps.
+
+    Examples:
+        >>> steps = np.array([0.0, 10.0, 20.0])
+        >>> runs = np.array([[1.0, 2.0, 3.0], [1.0, 4.0, 5.0]])
+        >>> print(Comparison("return", {"ecpo": (steps, runs)}).table().splitlines()[-1])
+        | ecpo | 2 | 20 | 2.750 ± 0.750 | 4.000 ± 1.000 | 3.000 |
+    """
 
     metric: str
     curves: dict[str, Curve]

@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 NEUTRAL = "#7a7a7a"
-"""Of text and axes: its contrast is the same, 4.3, to white and to a dark page."""
+"""The grey of text and axes. Its contrast is the same, 4.3, to white and to a dark page."""
 WIDTH = 7.6  # inches, at most, which is what a page of text has: pictures are not scaled
 STYLE: dict[str, Any] = {
     "axes.edgecolor": NEUTRAL,
@@ -54,6 +54,7 @@ STYLE: dict[str, Any] = {
 BLUE, GREEN, RED, PINK = "#0072B2", "#009E73", "#D55E00", "#CC79A7"
 ORANGE, SKY, PURPLE, BROWN = "#E69F00", "#56B4E9", "#7B5FD0", "#9C6240"
 COLOURS = (BLUE, GREEN, RED, PINK, ORANGE, SKY, PURPLE, BROWN)
+"""Those that are given to methods without one in the table."""
 METHOD_COLOURS = {
     **dict.fromkeys(("ecpo", "ecac", "centred", "centredscale", "meanseeking"), BLUE),
     **dict.fromkeys(("urex", "sac", "noprojection", "referencekept"), GREEN),
@@ -67,7 +68,7 @@ METHOD_COLOURS = {
     **dict.fromkeys(("repsentropy", "lstm", "aselsewhereat1e3"), BROWN),
     "smallstartat3e4": BLUE,
 }
-"""Of a method, by the letters and digits of its name: the same in every picture."""
+"""The colour of a method in every picture, by the letters and digits of its name."""
 
 Curves = Mapping[str, tuple[np.ndarray, np.ndarray]]
 """By method, the steps ``[n]`` and the values ``[runs, n]``."""

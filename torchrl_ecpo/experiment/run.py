@@ -30,6 +30,7 @@ from torchrl_ecpo.experiment.figures import plot_learning_curve
 __all__ = ["METRICS_FILE", "MetricsTable", "Run", "read_metrics"]
 
 METRICS_FILE = "metrics.csv"
+"""Name of the record in the directory of a run."""
 BACKENDS = ("csv", "tensorboard", "wandb")
 RECORDED_PACKAGES = ("torchrl-ecpo", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
 
@@ -44,6 +45,9 @@ class MetricsTable:
 
     Args:
         path: of the csv file.
+
+    Raises:
+        ValueError: by :meth:`log_metrics` and :meth:`cut_back`, for a step that does not go on.
 
     Examples:
         >>> import tempfile
@@ -206,6 +210,18 @@ class Run:
 
     Raises:
         ValueError: for an unknown backend.
+
+    Examples:
+        >>> import tempfile
+        >>> logger = {"backend": "csv", "project": "mine", "wandb_mode": "offline"}
+        >>> run = Run(
+        ...     OmegaConf.create({"seed": 1, "logger": logger}), total=20, unit="trajectories",
+        ...     name="mine", shown=[], directory=tempfile.mkdtemp(), show_bar=False)
+        >>> with run:
+        ...     run.log({"return": 1.0}, step=10)
+        ...     run.log({"return": 2.0}, step=20)
+        >>> read_metrics(run.directory)
+        {'step': [10.0, 20.0], 'return': [1.0, 2.0]}
     """
 
     def __init__(

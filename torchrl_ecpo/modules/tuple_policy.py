@@ -297,6 +297,10 @@ class TupleTables(nn.Module):
         device: of the parameters.
         dtype: of the parameters.
 
+    Raises:
+        TypeError: if `num_classes` is no sequence.
+        ValueError: for a `window` below 2, and numbers of classes that are no positive integers.
+
     Examples:
         >>> import torch
         >>> from torchrl_ecpo.modules import TupleTables

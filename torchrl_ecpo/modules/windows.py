@@ -171,6 +171,10 @@ class OneHotLinear(nn.Linear):
         device: of the parameters.
         dtype: of the parameters.
 
+    Raises:
+        TypeError: if `num_classes` is no sequence.
+        ValueError: for numbers of classes that are no positive integers.
+
     Examples:
         >>> import torch
         >>> from torchrl_ecpo.modules import OneHotLinear

@@ -74,7 +74,14 @@ def check_policy(distribution: type | Distribution) -> None:
 
 
 class SampledActions(NamedTuple):
-    """M actions of a continuous policy at each state, which stand for it by their number."""
+    """M actions of a continuous policy at each state, which stand for it by their number.
+
+    Examples:
+        >>> policy = Independent(Normal(torch.zeros(3, 2), torch.ones(3, 2)), 1)  # 3 states, A = 2
+        >>> actions = SampledActions.of(policy, 8)
+        >>> actions.action.shape, actions.log_prob.shape
+        (torch.Size([8, 3, 2]), torch.Size([8, 3]))
+    """
 
     log_prob: Tensor
     """``[M, *B]``, under the policy that drew them; in a space whose volume is the actions'."""
@@ -152,7 +159,14 @@ class SampledActions(NamedTuple):
 
 
 class PairedActions(SampledActions):
-    """M actions of a Gaussian policy in antithetic pairs, valued together with their gradient."""
+    """M actions of a Gaussian policy in antithetic pairs, valued together with their gradient.
+
+    Examples:
+        >>> policy = Independent(Normal(torch.zeros(3, 2), torch.ones(3, 2)), 1)  # 3 states, A = 2
+        >>> one, other = PairedActions.of(policy, 2).action
+        >>> torch.equal(one, -other)
+        True
+    """
 
     @classmethod
     def of(cls, distribution: Distribution, num_samples: int) -> SampledActions:
@@ -167,7 +181,13 @@ class PairedActions(SampledActions):
 
 
 class AllActions(NamedTuple):
-    """All n actions of a discrete policy; those that a mask forbids have no part in anything."""
+    """All n actions of a discrete policy; those that a mask forbids have no part in anything.
+
+    Examples:
+        >>> actions = AllActions.of(Categorical(logits=torch.zeros(4)))
+        >>> round(actions.mean(torch.tensor([0.0, 0.0, 0.0, 4.0])).item(), 4)
+        1.0
+    """
 
     log_prob: Tensor
     """``[n, *B]``; of an action without probability very low, but finite."""
@@ -227,6 +247,7 @@ class AllActions(NamedTuple):
 
 
 Actions = SampledActions | AllActions
+"""Either, as :func:`actions_of` returns them."""
 
 
 def gaussian_parameters(distribution: Distribution) -> tuple[Tensor, Tensor]:

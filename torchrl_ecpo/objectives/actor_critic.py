@@ -61,7 +61,17 @@ ESTIMATORS: tuple[type, ...] = (TD0Estimator, TD1Estimator, TDLambdaEstimator)
 
 
 class Lift(NamedTuple):
-    """The lifted policy at each state, on the actions that stand for it; without gradients."""
+    """The lifted policy at each state, on the actions that stand for it; without gradients.
+
+    Examples:
+        >>> from torch.distributions import Categorical
+        >>> actions = AllActions.of(Categorical(logits=torch.zeros(2, 3)))  # 3 actions at 2 states
+        >>> score = torch.tensor([0.0, 0.0, 1.0]).expand(2, 3).T
+        >>> log_weights, value = actions.lift(score, torch.tensor(0.1), torch.tensor(0.1))
+        >>> lift = Lift(actions, score, log_weights, log_weights.softmax(0), value)
+        >>> lift.weights.argmax(0).tolist()
+        [2, 2]
+    """
 
     actions: Actions
     """Those of the reference policy."""
@@ -79,7 +89,15 @@ class Lift(NamedTuple):
 
 @dataclass(eq=False)
 class States:
-    """What a member is given: the states ``[*B]`` at which the policy learns."""
+    """What a member is given: the states ``[*B]`` at which the policy learns.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torch.distributions import Categorical
+        >>> policy = Categorical(logits=torch.zeros(2, 3))
+        >>> States(TensorDict({}, [2]), policy, policy, lambda *_: "made once").lift
+        'made once'
+    """
 
     observations: TensorDictBase
     """What the networks read there."""
@@ -108,6 +126,23 @@ class ActorCriticLoss(PolicyLoss):
     it is not, M samples of it are.
 
     The arguments are documented where users meet them: :class:`~torchrl_ecpo.ECACLoss`.
+
+    Raises:
+        ValueError: as :class:`~torchrl_ecpo.ECACLoss`.
+
+    Examples:
+        ECAC by Eq. 11, without its options:
+
+        >>> from torchrl.data import Bounded
+        >>> from torchrl_ecpo.modules import make_qvalue_network, make_tanh_gaussian_actor
+        >>> class PlainECACLoss(ActorCriticLoss):
+        ...     def project(self, states):
+        ...         lift = states.lift
+        ...         log_prob = lift.actions.log_prob_of(states.policy)
+        ...         return Surrogate(-(lift.weights * log_prob).sum(0), lift.weights)
+        >>> actor = make_tanh_gaussian_actor(3, Bounded(-1.0, 1.0, shape=(2,)))
+        >>> PlainECACLoss(actor, make_qvalue_network(3, 2)).out_keys[:2]
+        ['loss_actor', 'loss_qvalue']
     """
 
     has_soft_value: ClassVar[bool] = True

@@ -272,6 +272,10 @@ class DiscreteECACLoss(ECACLoss):
             None, a fixed tau_prime. n is the number of actions that a mask leaves; other targets
             lie between 0 and its logarithm.
 
+    Raises:
+        ValueError: as :class:`ECACLoss` and, when called, for a `target_entropy` that the actions
+            cannot have.
+
     Examples:
         >>> import torch
         >>> from tensordict.nn import TensorDictModule

@@ -57,6 +57,10 @@ class ECPOLoss(LiftProjectLoss):
             reference's, as in Algorithm 1.
         reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
+    Raises:
+        ValueError: for an unknown `entropy`, for ``"matched"`` with ``score="return"``, and as
+            :class:`TrajectoryGroupLoss`.
+
     Examples:
         A batch of 3 groups of K = 4 trajectories of T = 5 steps:
 

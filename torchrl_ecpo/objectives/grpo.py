@@ -53,6 +53,10 @@ class GRPOLoss(TrajectoryGroupLoss):
             to False: it is the policy that drew the trajectories.
         reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
+    Raises:
+        ValueError: for a `clip_epsilon` below 0 or, downwards, of 1 or more, for an unknown
+            `aggregation` or `ratio`, and as :class:`TrajectoryGroupLoss`.
+
     Examples:
         >>> from torchrl_ecpo.envs import BanditEnv
         >>> from torchrl_ecpo.modules import make_softmax_policy

@@ -33,6 +33,9 @@ class MENTLoss(TrajectoryGroupLoss):
         score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
         reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
+    Raises:
+        ValueError: for a `tau` below 0, and as :class:`TrajectoryGroupLoss`.
+
     Examples:
         >>> from torchrl_ecpo.envs import BanditEnv
         >>> from torchrl_ecpo.modules import make_softmax_policy

@@ -33,6 +33,9 @@ class PMDLoss(LiftProjectLoss):
         delay_actor: see :class:`ECPOLoss`. Defaults to False.
         reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
+    Raises:
+        ValueError: for temperatures below 0 or both 0, and as :class:`TrajectoryGroupLoss`.
+
     Examples:
         >>> from torchrl_ecpo.envs import BanditEnv
         >>> from torchrl_ecpo.modules import make_softmax_policy

@@ -39,6 +39,9 @@ class PMDACLoss(ActorCriticLoss):
             target are estimated; the projection does not need them. Default: 1.
         delay_actor: default: True.
 
+    Raises:
+        ValueError: as :class:`~torchrl_ecpo.ECACLoss`.
+
     Examples:
         >>> import torch
         >>> from torchrl.data import Bounded
@@ -106,6 +109,9 @@ class DiscretePMDACLoss(PMDACLoss):
     Keyword Args:
         tau_prime: default: 0.1.
         target_entropy: default: None, a fixed tau_prime.
+
+    Raises:
+        ValueError: as :class:`~torchrl_ecpo.DiscreteECACLoss`.
 
     Examples:
         >>> import torch

@@ -41,6 +41,10 @@ class TPOLoss(TrajectoryGroupLoss):
             that drew the trajectories.
         reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
+    Raises:
+        ValueError: for a `tau` that is not above 0, a `length_norm` that is no bool, and as
+            :class:`TrajectoryGroupLoss`.
+
     Examples:
         >>> from torchrl_ecpo.envs import BanditEnv
         >>> from torchrl_ecpo.modules import make_softmax_policy

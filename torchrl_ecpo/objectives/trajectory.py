@@ -68,7 +68,13 @@ OF_GROUPS = ("kl_reference_policy", "entropy", "return", "equal_return_groups")
 
 
 class Steps(NamedTuple):
-    """The steps of the trajectories: numbers are ``[*G, K, T]``, 0 in padded steps."""
+    """The steps of the trajectories: numbers are ``[*G, K, T]``, 0 in padded steps.
+
+    Examples:
+        >>> steps = Steps(*torch.zeros(4, 2, 3, 5), mask=None)  # [*G, K, T]
+        >>> steps.rewards.sum(-1).shape
+        torch.Size([2, 3])
+    """
 
     rewards: Tensor
     log_prob: Tensor
@@ -85,7 +91,15 @@ class Steps(NamedTuple):
 
 
 class TrajectoryGroups(NamedTuple):
-    """Groups of K trajectories: sums over the real steps, ``[*G, K]``, and the steps themselves."""
+    """Groups of K trajectories: sums over the real steps, ``[*G, K]``, and the steps themselves.
+
+    Examples:
+        >>> steps = Steps(*torch.zeros(4, 2, 3, 5), mask=None)  # [*G, K, T]
+        >>> sums = torch.zeros(4, 2, 3)
+        >>> groups = TrajectoryGroups(*sums, mask=None, steps=steps, scores=sums[0])
+        >>> groups.num_steps[0].tolist()
+        [5.0, 5.0, 5.0]
+    """
 
     returns: Tensor
     """The return r(rho), the sum of the rewards."""
@@ -621,6 +635,25 @@ class LiftProjectLoss(TrajectoryGroupLoss):
             Defaults to 0.5, the middle of the values searched on the algorithmic tasks.
         tau_prime: temperature of the entropy, in the unit of the score. Defaults to 0.
         score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
+
+    Raises:
+        ValueError: for temperatures below 0 or both 0, and as :class:`TrajectoryGroupLoss`.
+
+    Examples:
+        ECPO without its options:
+
+        >>> from torchrl_ecpo.envs import BanditEnv
+        >>> from torchrl_ecpo.functional import mean_seeking_projection
+        >>> from torchrl_ecpo.modules import make_softmax_policy
+        >>> class PlainECPOLoss(LiftProjectLoss):
+        ...     def surrogate(self, groups):
+        ...         lift = self.lift(groups)
+        ...         return mean_seeking_projection(groups.log_prob, lift, mask=groups.mask)
+        >>> env = BanditEnv(num_actions=6, num_groups=3, group_size=4)
+        >>> actor = make_softmax_policy(env.features)
+        >>> loss = PlainECPOLoss(actor, tau=0.5, reduction="none")(env.rollout(1, actor))
+        >>> loss["loss_actor"].shape
+        torch.Size([3])
     """
 
     reads_steps = False
