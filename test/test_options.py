@@ -46,12 +46,11 @@ def split(options):
         ("env=gym env.hidden_sizes=[8]", "^env.hidden_sizes is called hidden_sizes.$"),
         # All at once, in a line each.
         (
-            "loss.tua=1 optim.lr=fast evaluation_interval=5 ~num_groups anneal_from={at_most:1}",
+            "loss.tua=1 optim.lr=fast evaluation_interval=5 anneal_from={at_most:1}",
             "^evaluation_interval is called evaluation.interval.\n"
             "There is no option anneal_from.at_most; the nearest one is .*\n"
             "anneal_from.metric must be given.\n"
             "anneal_from.at_least must be given.\n"
-            "num_groups must be given.\n"
             "optim.lr must be a number > 0, got 'fast'.\n"
             "There is no option loss.tua; the nearest one is loss.tau.$",
         ),
@@ -241,6 +240,7 @@ def test_hydra_s_own_flags_are_its_own(monkeypatch, options):
         ("ecac --multirun gamma=0,2", "ecac.py: gamma must be a number >= 0 and <= 1, got 2."),
         ("env=algorithmic", "Could not find 'env/algorithmic' Available options in 'env': bandit"),
         ("ecac env=gym", "ecac.py: env.name must be given.\n"),
+        ("resume=nowhere", "ecpo.py: resume=nowhere: there is no such directory.\n"),
         (
             "collector=multi_sync",
             "ecpo.py: num_groups=1 must be a multiple of the number of workers",

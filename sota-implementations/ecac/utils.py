@@ -92,9 +92,8 @@ SHOWN = ("evaluation_return", "return", "entropy", "alpha", "tau", "tau_prime", 
 
 def check_config(config: DictConfig, options: Sequence[str] = ()) -> None:
     """Refuse options that do not go together."""
-    if config.env.kind == "gym":
-        with closing(_make_gym(config.env)) as env:
-            make_actor(config, env)
+    with closing(make_environment(config, seed=config.seed)) as env:
+        make_actor(config, env)
 
 
 # ------------------------------------------------------------------------------------ environments

@@ -25,6 +25,7 @@ def with_pixels(name: str, make: Callable[..., EnvBase]) -> EnvBase:
         ValueError: if it cannot be drawn, with what that takes.
     """
     os.environ.setdefault("MUJOCO_GL", "egl")
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # gymnasium draws into memory
     try:
         return make(from_pixels=True, pixels_only=False)
     except Exception as error:  # of each renderer another

@@ -326,17 +326,12 @@ def run_directory(resume: str | None, parent: str, name: str) -> str:
         resume: None, a run directory, or ``"auto"``: the last one in `parent` with a checkpoint.
         parent: of run directories, whose names sort by age.
         name: of a new run directory.
-
-    Raises:
-        FileNotFoundError: if the run directory does not exist.
     """
     if resume is None:
         return f"{parent}/{name}"
     if resume == "auto":
         runs = sorted({path.parents[1] for path in Path(parent).glob(f"*/{FOLDER}/checkpoint-*")})
         return str(runs[-1] if runs else Path(parent, name))
-    if not Path(resume).is_dir():
-        raise FileNotFoundError(f"resume={resume}: there is nothing to resume from, no directory.")
     return str(Path(resume).absolute())
 
 

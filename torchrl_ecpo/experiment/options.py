@@ -67,6 +67,9 @@ def check_command_line(script: str, check: Check | None = None) -> None:
                 if flags.help:
                     print(_help(folder / "config", config, options, name))
                     raise SystemExit
+                resume = config.get("resume")
+                if resume not in (None, "auto") and not Path(resume).is_dir():
+                    raise ValueError(f"resume={resume}: there is no such directory.")
                 if check is not None:
                     check(config, run)
     if problems:

@@ -370,7 +370,7 @@ def leaving_nothing(main: Callable[[DictConfig], None]) -> Callable[[DictConfig]
         try:
             main(config)
         except (ValueError, LookupError, OSError, ImportError, CheckpointError) as error:
-            is_alone = HydraConfig.get().mode == RunMode.RUN
+            is_alone = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.RUN
             if _clear() and is_alone and "HYDRA_FULL_ERROR" not in os.environ:
                 message = error.args[0] if isinstance(error, KeyError) else error
                 raise SystemExit(f"{Path(sys.argv[0]).name}: {message}") from None
