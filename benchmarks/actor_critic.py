@@ -51,7 +51,7 @@ from utils import (  # noqa: E402 # pyright: ignore[reportMissingImports]
 UPDATES = {
     "sac": ["loss=sac"],
     "ecac, M = 8": ["loss=ecac"],
-    "ecac, M = 16": ["loss=ecac", "loss.options.num_action_samples=16"],
+    "ecac, M = 16": ["loss=ecac", "loss.num_action_samples=16"],
 }
 LOOPS = {"sac": ["loss=sac"], "ecac": ["loss=ecac"]}
 
@@ -84,7 +84,7 @@ def make_parts(config: DictConfig) -> Parts:
     actor = make_actor(config, env)
     loss_module = make_loss(config, actor, env)
     updater = make_updater(config, loss_module)
-    return Parts(env, actor, loss_module, updater, make_optimizer(config.loss.lr, loss_module))
+    return Parts(env, actor, loss_module, updater, make_optimizer(config.optim.lr, loss_module))
 
 
 def make_data(config: DictConfig, parts: Parts) -> tuple[ReplayBuffer, Iterator[TensorDictBase]]:

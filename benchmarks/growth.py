@@ -56,7 +56,7 @@ def ecpo(G: int, K: int, T: int) -> Callable[[], Tensor]:
 
 def ecac(B: int, M: int) -> Callable[[], Tensor]:
     """The losses of a batch of random transitions."""
-    sizes = [f"loss.options.num_action_samples={M}", f"loss.options.num_actor_states={B // 2}"]
+    sizes = [f"loss.num_action_samples={M}", f"loss.num_actor_states={B // 2}"]
     env, _, loss_module, *_ = make_parts(configure(["loss=ecac", *sizes]))
     batch = random_batch(env.fake_tensordict(), B)
     return lambda: total(loss_module(batch.copy()), is_policy_due=True)

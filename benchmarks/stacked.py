@@ -86,7 +86,7 @@ def stacked_runs(env: str, level: int | None, number: int) -> Iteration:
     for member in stack.members:
         lengthen(member.task, level)
         member.config.project_steps = PROJECT_STEPS
-        member.config.evaluation_interval = 1_000_000
+        member.config.evaluation.interval = 1_000_000
 
     def iterate() -> int:
         stack.lift()

@@ -8,7 +8,9 @@ import sys
 from pathlib import Path
 
 FORKED = multiprocessing.get_context("forkserver")
-FORKED.set_forkserver_preload(["torchrl_ecpo.experiment", "torchrl_ecpo.collectors", "hydra"])
+FORKED.set_forkserver_preload(
+    ["torchrl_ecpo.experiment.checkpoint", "torchrl_ecpo.collectors", "torchrl_ecpo.objectives"]
+)
 AS_A_PROGRAM = """
 import os, runpy, sys
 os.chdir({directory!r})

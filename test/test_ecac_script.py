@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import itertools
 import json
 import math
@@ -14,6 +15,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+from PIL import Image
 from processes import run_script
 from tensordict import TensorDict
 from torchrl.envs import GymEnv
@@ -31,7 +33,7 @@ TINY = (
     "collector.init_random_frames=80",
     "hidden_sizes=[16,16]",
     "replay_buffer.batch_size=32",
-    "loss.options.num_actor_states=16",
+    "loss.num_actor_states=16",
 )
 LOSSES = ("ecac", "pmd_ac", "mpo", "sac", "sac_score", "td3", "ddpg")
 
@@ -136,18 +138,17 @@ def test_evaluation_does_not_disturb_training(sweep, tmp_path):
     [
         (
             *("env=hopper", "replay_buffer.storage=memmap"),
-            *("loss.options.projection=gradient", "loss.options.width_entropy=0.4"),
+            *("loss.projection=gradient", "loss.width_entropy=0.4"),
         ),
         (
             *("env=dm_control", "env.name=pendulum", "env.task=swingup"),
-            *("loss=sac", "loss.options.width_entropy=0.4"),
+            *("loss=sac", "loss.width_entropy=0.4"),
         ),
         pytest.param(("collector=multi_sync", "loss=sac"), marks=pytest.mark.slow),
         (
-            *("loss.reference_interval=5", "loss.options.projection=paper"),
-            *("loss.value_network=true", "+loss.lr.value_network=3e-4"),
-            *("loss.options.target_kl=null", "~loss.lr.log_tau"),
-            "loss.options.tau={schedule:linear,start:0.2,end:0.1,duration:160}",
+            *("loss.reference_interval=5", "loss.projection=paper"),
+            *("loss.value_network=true", "loss.target_kl=null"),
+            "loss.tau={schedule:linear,start:0.2,end:0.1,duration:160}",
         ),
     ],
     ids=" ".join,
@@ -161,6 +162,43 @@ def test_tasks_collectors_and_ablations_run(tmp_path, options):
     if any("schedule" in option for option in options):
         # Counted from the first update on: 160 frames are left after the random ones.
         assert metrics["tau"][1:] == pytest.approx([0.15, 0.1], abs=0.01)
+
+
+def test_lengths_that_fit_no_interval_are_run_to_the_end(tmp_path):
+    """Rows are written when one is due, when the policy is evaluated, and at the end."""
+    odd = ("total_frames=250", "log_interval=70", "evaluation.interval=100")
+    metrics = run_ecac(tmp_path, "loss=sac", *odd)
+    assert metrics["step"] == [72, 104, 144, 200, 216, 256]  # in batches of 8
+    evaluated = [x == x for x in metrics["evaluation_return"]]
+    assert evaluated == [False, True, False, True, False, False]
+
+
+def test_without_entropy_is_one_option(utils, build):
+    """Neither a bonus nor a temperature that is learned, and the same numbers as in more words."""
+    config, _, loss_module = build("loss.tau_prime=0")
+    _, _, same = build("loss.tau_prime=0", "loss.target_entropy=null")
+    assert "log_tau_prime" not in dict(loss_module.named_parameters())
+    utils.make_optimizer(config.optim.lr, loss_module)  # whose rate is there for nothing
+    batch = random_transitions()
+    losses = []
+    for each in (loss_module, same):
+        torch.manual_seed(0)
+        losses.append(each(batch.clone()).detach().to_dict())
+    assert losses[0]["tau_prime"] == 0
+    torch.testing.assert_close(*losses)
+
+
+def test_play_shows_what_a_run_has_learned(tmp_path, utils, capsys):
+    run_ecac(tmp_path, "loss=sac")
+    importlib.import_module("play").main([str(tmp_path), "--episodes", "2"])
+    first, second, mean, drawn = capsys.readouterr().out.splitlines()
+    returns = [
+        float(line.removeprefix("return ").removesuffix(", 200 steps")) for line in (first, second)
+    ]
+    assert float(mean.removeprefix("mean return ")) == pytest.approx(sum(returns) / 2, rel=1e-4)
+    assert drawn == f"the first one is drawn in {tmp_path / 'episode.gif'}"
+    with Image.open(tmp_path / "episode.gif") as video:
+        assert video.n_frames > 100  # equal ones are shown for longer
 
 
 @pytest.mark.parametrize("loss", [None, "discrete_pmd_ac"])
@@ -181,7 +219,7 @@ def utils(monkeypatch):
     import utils
 
     yield utils
-    for name in ("utils", "ecac"):
+    for name in ("utils", "ecac", "choice", "play"):
         sys.modules.pop(name, None)
 
 
@@ -192,7 +230,7 @@ def utils(monkeypatch):
         (["env=gym", "env.name=CartPole-v1"], "loss=ecac does not go with env.name=CartPole-v1.*"),
         (["env=pendulum", "loss=discrete_ecac"], "loss=discrete_ecac does not go with"),
         (["env=dm_control", "env.task=fly"], "env.name=cheetah env.task=fly cannot be made"),
-        (["~loss.lr.log_tau"], "loss.lr must have a learning rate for each of"),
+        (["~optim.lr.log_tau"], "optim.lr must have a learning rate for each of"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
@@ -201,7 +239,7 @@ def test_bad_options_end_with_a_clear_message(utils, overrides, message):
     with pytest.raises(ValueError, match=message):  # noqa: PT012 - the script's first steps
         env = utils.make_environment(config, seed=0)
         loss_module = utils.make_loss(config, utils.make_actor(config, env), env)
-        utils.make_optimizer(config.loss.lr, loss_module)
+        utils.make_optimizer(config.optim.lr, loss_module)
 
 
 @pytest.mark.parametrize(
@@ -216,7 +254,7 @@ def test_bad_options_end_with_a_clear_message(utils, overrides, message):
     ],
 )
 def test_the_loss_is_that_of_the_actions_unless_it_is_given(utils, options, expected):
-    assert utils.chosen_loss(options.split()) == expected
+    assert importlib.import_module("choice").chosen_loss(options.split()) == expected
 
 
 def test_pixels_are_read_by_networks_of_convolutions(utils, monkeypatch):
@@ -232,7 +270,7 @@ def test_pixels_are_read_by_networks_of_convolutions(utils, monkeypatch):
         def step(self, action):
             return self.observation_space.sample(), 1.0, False, False, {}
 
-    monkeypatch.setattr(utils.gym, "make", lambda name, **options: Screen())
+    monkeypatch.setattr(gym, "make", lambda name, **options: Screen())
     config = configure(["env=gym", "env.name=Screen", "loss=discrete_ecac"])
     env = utils.make_environment(config, seed=0)
     actor = utils.make_actor(config, env)
@@ -250,7 +288,7 @@ def test_a_missing_simulator_is_named_with_its_extra(utils, monkeypatch):
     def fail(name, **options):
         raise gym.error.DependencyNotInstalled("No mujoco.")
 
-    monkeypatch.setattr(utils.gym, "make", fail)
+    monkeypatch.setattr(gym, "make", fail)
     config = configure(["env=gym", "env.name=Ant-v5"])
     with pytest.raises(ModuleNotFoundError, match=r"Ant-v5 .* pip install '\.\[mujoco\]'"):
         utils.make_environment(config, seed=0)
@@ -259,8 +297,8 @@ def test_a_missing_simulator_is_named_with_its_extra(utils, monkeypatch):
 @pytest.mark.parametrize(
     ("error", "message"),
     [
-        (gym.error.DependencyNotInstalled("No pygame: pip install it."), "Pendulum-v1: No pygame:"),
-        (RuntimeError("No display."), r"Pendulum-v1: No display\. MuJoCo .* MUJOCO_GL .* egl"),
+        (ModuleNotFoundError("No pygame."), r"pendulum: pygame\. pip install '\.\[video\]'"),
+        (RuntimeError("No display."), r"pendulum: pygame\. MuJoCo .* MUJOCO_GL .* egl"),
     ],
 )
 def test_a_video_that_cannot_be_drawn_says_what_to_install(utils, monkeypatch, error, message):
@@ -272,8 +310,8 @@ def test_a_video_that_cannot_be_drawn_says_what_to_install(utils, monkeypatch, e
 
     monkeypatch.setattr(utils, "GymWrapper", Env)
     config = configure(["evaluation.video=true"])
-    with pytest.raises(RuntimeError, match=f"evaluation.video=true cannot draw {message}"):
-        utils.make_environment(config, seed=0, is_evaluation=True)
+    with pytest.raises(ValueError, match=f"There is no video of {message}"):
+        utils.make_evaluation_environment(config)
     utils.make_environment(config, seed=0)  # training draws nothing
 
 
@@ -299,7 +337,7 @@ def test_a_video_of_the_first_episode_is_saved(utils, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     config = OmegaConf.create({"episodes": 2, "video": True})
     assert utils.evaluate(Env(), None, config, 40) == {"evaluation_return": 3.0}
-    with utils.Image.open("evaluation_40.gif") as video:
+    with Image.open("evaluation_40.gif") as video:
         assert (video.n_frames, video.size) == (4, (6, 8))
 
 
@@ -373,7 +411,7 @@ def test_a_compiled_update_that_leaves_the_policy_leaves_it(utils, build):
 
     def weights(*, is_compiled):
         config, actor, loss_module = build("loss=td3")
-        optimizer = utils.make_optimizer(config.loss.lr, loss_module)
+        optimizer = utils.make_optimizer(config.optim.lr, loss_module)
         policies = []
         for count in range(1, 5):
             losses, is_due = loss_module(random_transitions()), count % 2 == 0
@@ -394,11 +432,11 @@ def test_adam_has_a_group_for_each_learning_rate(utils, build):
     config, _, loss_module = build()
     rates = {
         parameter: group["lr"]
-        for group in utils.make_optimizer(config.loss.lr, loss_module).param_groups
+        for group in utils.make_optimizer(config.optim.lr, loss_module).param_groups
         for parameter in group["params"]
     }
     for name, parameter in loss_module.named_parameters():
-        assert rates[parameter] == config.loss.lr[name.split(".")[0].removesuffix("_params")]
+        assert rates[parameter] == config.optim.lr[name.split(".")[0].removesuffix("_params")]
     assert len(rates) == len(list(loss_module.parameters()))
 
 
@@ -406,7 +444,7 @@ def test_on_humanoid_ecac_s_policy_alone_starts_small_and_learns_slower(utils):
     env = utils.make_environment(configure([]), seed=0)  # whichever
     for name, rate, gain in (("pendulum", 1e-3, 1.0), ("ant", 1e-3, 1.0), ("humanoid", 3e-4, 0.01)):
         config = configure([f"env={name}"])
-        assert config.loss.lr.actor_network == rate
+        assert config.optim.lr.actor_network == rate
         assert next(iter(utils.make_actor(config, env))).final_gain == gain
     for loss in set(LOSSES) - {"ecac"}:
         there, elsewhere = (

@@ -34,13 +34,13 @@ DAMAGES = (
 CONTROL = (
     *("ecac", "log_interval=8", "evaluation.interval=160", "evaluation.episodes=1"),
     *("collector.init_random_frames=80", "hidden_sizes=[16,16]", "replay_buffer.batch_size=16"),
-    "loss.options.num_actor_states=8",
+    "loss.num_actor_states=8",
 )
 RUNS = {
     "bandit": ("ecpo", "env.num_actions=100", "group_size=10", "total_trajectories=2000"),
     "copy": (
         *("ecpo", "env=copy", "policy.hidden_size=8", "num_groups=2", "group_size=5"),
-        *("project_steps=2", "total_trajectories=2000", "evaluation_interval=20"),
+        *("project_steps=2", "total_trajectories=2000", "evaluation.interval=20"),
     ),
     "pendulum": (*CONTROL, "env=pendulum", "total_frames=800"),
     "hopper": (*CONTROL, "env=hopper", "total_frames=800"),

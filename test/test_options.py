@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -13,7 +15,7 @@ from omegaconf import OmegaConf
 from processes import run_script
 
 from torchrl_ecpo.experiment import check_command_line, compose_options
-from torchrl_ecpo.experiment.run import flatten
+from torchrl_ecpo.experiment.options import flatten
 
 SCRIPTS = Path(__file__).parents[1] / "sota-implementations"
 SCHEDULE = "loss.tau={schedule:linear,start:1,end:0,duration:4}"
@@ -35,9 +37,27 @@ def split(options):
         ("settings=group_curriculum", "no option settings; the nearest one is setting."),
         ("env.bandit.num_actions=3", "no option env.bandit.*nearest one is env.num_actions."),
         ("env=copy env.hidden_size=8", "env.hidden_size; the nearest one is policy.hidden_size."),
-        ("ecac +loss.tau=0.5", "no option loss.tau; the nearest one is loss.options.tau."),
-        ("ecac +optim.lr=7", "no option optim.lr; the nearest one is loss.lr."),
-        ("ecac loss=sac +loss.options.tau=1", "no option loss.options.tau"),
+        ("ecac optim.lr=7", "optim.lr must be a mapping, got 7."),
+        # Former names.
+        ("ecac loss.options.tau=1", "^loss.options.tau is called loss.tau.$"),
+        ("ecac +loss.lr.log_tau=1", "^loss.lr.log_tau is called optim.lr.log_tau.$"),
+        ("ecac ~loss.lr.log_tau", "^loss.lr.log_tau is called optim.lr.log_tau.$"),
+        ("evaluation_interval=5", "^evaluation_interval is called evaluation.interval.$"),
+        ("env=gym env.hidden_sizes=[8]", "^env.hidden_sizes is called hidden_sizes.$"),
+        # All at once, in a line each.
+        (
+            "loss.tua=1 optim.lr=fast evaluation_interval=5 anneal_from={at_most:1}",
+            "^evaluation_interval is called evaluation.interval.\n"
+            "There is no option anneal_from.at_most; the nearest one is .*\n"
+            "anneal_from.metric must be given.\n"
+            "anneal_from.at_least must be given.\n"
+            "optim.lr must be a number > 0, got 'fast'.\n"
+            "There is no option loss.tua; the nearest one is loss.tau.$",
+        ),
+        ("ecac env=gym loss.tua=1", "^env.name must be given.\nThere is no option loss.tua;"),
+        # Numbers with an exponent are integers, if they are.
+        ("num_groups=1.5e0", "num_groups must be an integer >= 1, got 1.5."),
+        ("ecac loss=sac +loss.tau=1", "no option loss.tau"),
         ("ecac loss=sac loss.reference_interval=1", "no option loss.reference_interval"),
         ("~group_size", "group_size must be given."),
         ("ecac env=gym", "env.name must be given."),
@@ -50,9 +70,9 @@ def split(options):
         ("num_groups=null", "num_groups must be an integer >= 1, got None."),
         ("optim.lr=fast", "optim.lr must be a number > 0, got 'fast'."),
         ("resume=3", "resume must be text or null, got 3."),
-        ("env=gym env.hidden_sizes=64", "env.hidden_sizes must be a list, got 64."),
-        ("env=gym env.hidden_sizes=[64,0]", r"hidden_sizes\[1\] must be an integer >= 1, got 0."),
-        ("ecac loss.options.target_entropy=ayto", "must be a number or auto or null, got 'ayto'."),
+        ("env=gym hidden_sizes=64", "hidden_sizes must be a list, got 64."),
+        ("env=gym hidden_sizes=[64,0]", r"hidden_sizes\[1\] must be an integer >= 1, got 0."),
+        ("ecac loss.target_entropy=ayto", "must be a number or auto or null, got 'ayto'."),
         ("loss.tau.start=1", "loss.tau: .*schedule must be one of"),
         (SCHEDULE.replace("end", "to"), "loss.tau: Wrong arguments for the schedule 'linear'"),
         (SCHEDULE.replace("0", "-1"), "loss.tau.end must be a number >= 0, got -1."),
@@ -75,7 +95,7 @@ def split(options):
         ("ecac gamma=2", "gamma must be a number >= 0 and <= 1, got 2."),
         ("ecac polyak=0", "polyak must be a number > 0 and <= 1, got 0."),
         ("ecac replay_buffer.storage=tape", "must be tensor or memmap, got 'tape'."),
-        ("ecac loss.options.projection=mean", "must be centred or paper or gradient, got 'mean'."),
+        ("ecac loss.projection=mean", "must be centred or paper or gradient, got 'mean'."),
         ("logger.backend=excel", "must be csv or tensorboard or wandb, got 'excel'."),
     ],
 )
@@ -85,25 +105,63 @@ def test_what_is_wrong_is_named(options, message):
         compose_options(SCRIPTS / script, given)
 
 
-@pytest.mark.parametrize("script", ["ecpo", "ecac"])
+def compositions(script):
+    """One for each choice."""
+    for path in (SCRIPTS / script / "config").glob("[!s]*/*.yaml"):  # not the settings
+        group = path.parent.name
+        # loss.tau is the form's
+        task = ["env=copy"] if script == "ecpo" and group in ("policy", "form") else []
+        form = ["form=paper"] if script == "ecpo" and group == "loss" else []
+        name = ["env.name=CartPole-v1"] if (script, path.stem) == ("ecac", "gym") else []
+        yield [*task, *form, f"{group}={path.stem}", *name]
+
+
+@pytest.mark.parametrize("script", ["ecpo", "ecac", "llm"])
 def test_the_defaults_are_right_and_say_what_options_take(script):
     folder = SCRIPTS / script
     kinds, names = yaml.safe_load((folder / "options.yaml").read_text()), set()
-    for path in (folder / "config").glob("[!s]*/*.yaml"):  # not the settings
-        if path.stem in ("algorithmic", "exploration", "gym"):
-            continue  # incomplete
-        group = path.parent.name
-        task = ["env=copy"] if group in ("policy", "form") else []  # loss.tau is the form's
-        form = ["form=paper"] if script == "ecpo" and group == "loss" else []
-        config = compose_options(folder, [*task, *form, f"{group}={path.stem}"])
+    for given in compositions(script):
+        config = compose_options(folder, given)
         entries = flatten(OmegaConf.to_container(config, resolve=True))
         names |= entries.keys()
         empty = {name for name, value in entries.items() if value == "None" and "ray" not in name}
         assert empty <= kinds.keys(), "null alone says nothing of what an option takes"
-    optional = {name for name, kind in kinds.items() if kind.endswith("or nothing")}
-    unset = ("collector.backend_options", "stop_when.")
-    optional |= {name for name in kinds if name.startswith(unset)}
-    assert kinds.keys() - optional <= names, "an option that no configuration has"
+    unset = ("collector.backend_options", "stop_when.", "anneal_from.")
+    optional = {name for name in kinds if name.startswith(unset)}
+    former = {name for name, kind in kinds.items() if kind.startswith("now ")}
+    assert kinds.keys() - optional - former <= names, "an option that no configuration has"
+    assert {kinds[name].removeprefix("now ") for name in former} <= names | {"loss", "optim.lr"}
+
+
+@pytest.mark.parametrize("script", ["ecpo", "ecac", "llm"])
+def test_help_has_a_word_on_each_choice_and_each_option(monkeypatch, capsys, script):
+    for given in compositions(script):
+        monkeypatch.setattr(sys, "argv", [f"{script}.py", *given, "--help"])
+        with pytest.raises(SystemExit) as ended:
+            check_command_line(str(SCRIPTS / script / f"{script}.py"))
+        assert ended.value.code is None
+        for line in capsys.readouterr().out.splitlines():
+            if line.startswith("  "):
+                assert len(line.split(maxsplit=1)) == 2, f"{given}: nothing is said of {line}"
+
+
+def test_help_comes_without_torch():
+    """Which takes seconds; hydra and the configuration take less than one."""
+    code = """
+import runpy, sys
+sys.modules["torch"] = None  # importing it fails
+sys.argv = [sys.argv[1], "--help"]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+    for script in ("ecpo", "ecac", "llm"):
+        path = SCRIPTS / script / f"{script}.py"
+        command = [sys.executable, "-c", code, str(path)]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(path.parent), *sys.path])}
+        process = subprocess.run(
+            command, capture_output=True, text=True, check=False, env=environment
+        )
+        assert process.returncode == 0, process.stderr
+        assert f"python {script}.py" in process.stdout
 
 
 @pytest.mark.parametrize(
@@ -113,8 +171,8 @@ def test_the_defaults_are_right_and_say_what_options_take(script):
         "env=copy anneal_from=null optim.max_grad_norm=null setting=[copy/ecpo,group_curriculum]",
         f"env=gym env.name=Acrobot-v1 loss=ecpo {SCHEDULE}",
         "collector=ray +collector.backend_options.ray_init_config.num_cpus=4",
-        "ecac loss.options.target_kl=null loss.options.tau=0.1 ~loss.lr.log_tau",
-        "ecac loss.value_network=true +loss.lr.value_network=3e-4 hidden_sizes=[]",
+        "ecac loss.target_kl=null loss.tau=0.1 optim.lr.log_tau=1e-3",
+        "ecac loss.value_network=true hidden_sizes=[]",
         "hydra/launcher=joblib hydra.run.dir='a=b,c' resume='a=b'",
     ],
 )
@@ -122,6 +180,16 @@ def test_what_is_right_is_composed_as_hydra_does(options):
     script, given = split(options)
     with initialize_config_dir(str(SCRIPTS / script / "config"), version_base="1.3"):
         assert compose_options(SCRIPTS / script, given) == compose("config", given)
+
+
+def test_numbers_with_an_exponent_are_integers():
+    stack = "stack=['loss=ecpo total_trajectories=2e3']"
+    given = ["total_trajectories=1e4", "num_groups=2.0E+1", "loss.tau=1e-3", stack]
+    config = compose_options(SCRIPTS / "ecpo", [*given, "hydra.run.dir='runs/1e4'"])
+    assert repr(config.total_trajectories) == "10000"
+    assert repr(config.num_groups) == "20"
+    assert config.loss.tau == 0.001
+    assert config.stack == ["loss=ecpo total_trajectories=2000"]
 
 
 def test_hydra_s_own_refusals_stand():
@@ -170,8 +238,14 @@ def test_hydra_s_own_flags_are_its_own(monkeypatch, options):
         ("policy=lstm", "ecpo.py: Could not override 'policy'. No match in the defaults list.\n"),
         ("+policy=lstm", "ecpo.py: policy= is for the algorithmic tasks, got env.kind='bandit'"),
         ("ecac --multirun gamma=0,2", "ecac.py: gamma must be a number >= 0 and <= 1, got 2."),
-        ("ecac log_interval=70", "evaluation.interval must be a multiple of log_interval"),
-        ("ecac total_frames=200", "total_frames must be a multiple of log_interval, or the last"),
+        ("env=algorithmic", "Could not find 'env/algorithmic' Available options in 'env': bandit"),
+        ("ecac env=gym", "ecac.py: env.name must be given.\n"),
+        ("resume=nowhere", "ecpo.py: resume=nowhere: there is no such directory.\n"),
+        (
+            "collector=multi_sync",
+            "ecpo.py: num_groups=1 must be a multiple of the number of workers",
+        ),
+        ("anneal_from={metric:foo,at_least:1}", "ecpo.py: anneal_from.metric and stop_when.metric"),
     ],
 )
 def test_a_script_says_so_in_one_line_and_makes_no_directory(tmp_path, options, message):

@@ -6,6 +6,7 @@ import importlib
 import json
 import math
 import os
+import re
 import shutil
 import sys
 from itertools import pairwise
@@ -18,7 +19,8 @@ from omegaconf import OmegaConf
 from processes import run_script
 from tensordict import TensorDict
 
-from torchrl_ecpo.experiment import compare, read_metrics
+from torchrl_ecpo.experiment import compare, compose_options, read_metrics
+from torchrl_ecpo.experiment._tasks import is_plain, open_task
 
 ROOT = Path(__file__).parents[1]
 ECPO = ROOT / "sota-implementations/ecpo/ecpo.py"
@@ -75,6 +77,11 @@ def test_every_loss_trains_on_the_bandit(sweep, loss):
     assert json.loads((run / "summary.json").read_text())["finished"] is True
     assert OmegaConf.load(run / "config.yaml").loss.name == loss
     assert (run / "curve.png").exists()
+    command = (run / "command.txt").read_text()
+    assert command.startswith(f"python {ECPO} loss={loss} form=paper seed=5 project_steps=3 ")
+    commit = json.loads((run / "versions.json").read_text())["commit"]
+    assert re.fullmatch(r"[0-9a-f]{40}(-dirty)?|unknown", commit)
+    assert not list(run.glob("*.log"))
     # Trajectories 1 to 30 and 31 to 60 are of one reference each: right after a lift the policy
     # is the reference, then it moves away.
     kl = metrics["kl_reference_policy"]
@@ -222,7 +229,7 @@ def test_a_sweep_over_two_processes_gives_the_metrics_of_single_runs(
 @pytest.mark.parametrize(
     "options",
     [
-        ("env=copy", "total_trajectories=40", "num_groups=2", "evaluation_interval=1"),
+        ("env=copy", "total_trajectories=40", "num_groups=2", "evaluation.interval=1"),
         ("env=copy", "total_trajectories=80", "num_groups=2", "collector=multi_sync"),
         pytest.param(
             ("env=gym", "total_trajectories=64", "env.max_steps=5", "collector=multi_async"),
@@ -240,7 +247,7 @@ def test_a_sweep_over_two_processes_gives_the_metrics_of_single_runs(
             "total_trajectories=40",
             "logger.backend=tensorboard",
         ),
-        ("env=gym", "total_trajectories=64", "env.max_steps=5", "evaluation_interval=1"),
+        ("env=gym", "total_trajectories=64", "env.max_steps=5", "evaluation.interval=1"),
         ("env=deep_sea", "total_trajectories=64", "loss=trust_pcl"),  # with a value network
         (
             "env=gym",
@@ -345,7 +352,7 @@ def check_training(directory, names, **options):
         "num_groups=1",
         "group_size=3",
         "total_trajectories=6",
-        "evaluation_interval=1",
+        "evaluation.interval=1",
         f"hydra.sweep.dir={directory}",
         "hydra.sweep.subdir=${hydra:job.num}",
         **options,
@@ -366,16 +373,27 @@ def check_training(directory, names, **options):
         ("Missing", "env.name=own_tasks:Missing-v0 is no task of gymnasium"),
     ],
 )
-def test_a_task_that_cannot_be_played_is_refused_at_the_door(
-    script_modules, own_tasks, name, message
-):
+def test_a_task_that_cannot_be_played_is_refused_at_the_door(own_tasks, name, message):
     with pytest.raises(ValueError, match=message):
-        script_modules("utils").check_copies(f"{own_tasks}:{name}-v0")
+        is_plain(f"{own_tasks}:{name}-v0")
 
 
-def test_a_task_whose_package_is_not_there_says_so(script_modules):
-    with pytest.raises(ValueError, match=r"env\.name=nowhere:Task-v0 needs what is not installed"):
-        script_modules("tasks").make_copy("nowhere:Task-v0")
+def test_a_task_whose_package_is_not_there_says_so():
+    message = r"env\.name=nowhere:Task-v0 needs what is not installed"
+    with pytest.raises(ModuleNotFoundError, match=message):
+        open_task("nowhere:Task-v0")
+
+
+def test_a_task_is_opened_no_more_often_than_it_is_played(script_modules, monkeypatch):
+    """Twice at the door, ten times for the evaluation, and the vector's own copy."""
+    is_plain.cache_clear()
+    make, opened = gym.make, []
+    monkeypatch.setattr(gym, "make", lambda name, **options: opened.append(name) or make(name))
+    config = compose_options(ECPO.parent, ["env=gym", "env.name=MountainCar-v0"])
+    script_modules("utils").check_config(config)
+    assert len(opened) == 2
+    script_modules("tasks").make_task(config)
+    assert len(opened) == 2 + 10
 
 
 def test_a_run_without_weights_or_entropy_says_so_once(script_modules, capsys):
@@ -440,7 +458,7 @@ def test_a_compiled_run_gives_the_metrics_of_a_run_that_is_not(tmp_path, env):
 
 @pytest.mark.slow  # two to five minutes
 def test_groups_of_eight_learn_cartpole(tmp_path):
-    options = ("env=gym", "form=paper", "seed=0", "evaluation_interval=10")
+    options = ("env=gym", "form=paper", "seed=0", "evaluation.interval=10")
     run_ecpo(tmp_path, *options, f"hydra.run.dir={tmp_path}")
     returns = [value for value in read_metrics(tmp_path)["greedy_return"] if value == value]
     assert max(returns) >= 475, returns

@@ -7,6 +7,14 @@ from __future__ import annotations
 
 import sys
 
+from choice import chosen_loss
+
+from torchrl_ecpo.experiment.options import check_command_line
+
+if __name__ == "__main__":  # before torch is imported, which takes seconds
+    sys.argv += chosen_loss(sys.argv[1:])
+    check_command_line(__file__)
+
 import hydra
 import torch
 from omegaconf import DictConfig
@@ -19,13 +27,12 @@ from utils import (
     Every,
     Speed,
     check_config,
-    chosen_loss,
     compute_losses,
     evaluate,
     finished_returns,
     make_actor,
     make_collector,
-    make_environment,
+    make_evaluation_environment,
     make_loss,
     make_optimizer,
     make_policy,
@@ -41,8 +48,8 @@ from torchrl_ecpo.experiment import (
     Checkpoints,
     Progress,
     Run,
-    check_command_line,
     compile_module,
+    leaving_nothing,
 )
 
 
@@ -66,17 +73,18 @@ def descend(loss: Tensor, optimizer: torch.optim.Optimizer, kept: nn.Module | No
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
+@leaving_nothing
 def main(config: DictConfig) -> None:
     checkpoints = Checkpoints(config)
     torch.set_num_threads(config.threads)
 
-    evaluation_env = make_environment(config, seed=config.seed + 1_000_000, is_evaluation=True)
+    evaluation_env = make_evaluation_environment(config)
     torch.manual_seed(config.seed)
     actor = make_actor(config, evaluation_env)
     loss_module = make_loss(config, actor, evaluation_env)
     temperatures = make_temperatures(config.loss, loss_module)
     updater = make_updater(config, loss_module)
-    optimizer = make_optimizer(config.loss.lr, loss_module)
+    optimizer = make_optimizer(config.optim.lr, loss_module)
     replay_buffer = make_replay_buffer(config)
     collector = make_collector(config, make_policy(config.loss, actor, evaluation_env))
     if config.compile:
@@ -136,13 +144,15 @@ def main(config: DictConfig) -> None:
                 temperatures.step(len(transitions))
                 collector.update_policy_weights_()
 
-            if is_log_due(progress.frames):
+            is_over = progress.frames >= config.total_frames
+            is_evaluated = is_evaluation_due(progress.frames)
+            if is_log_due(progress.frames) or is_evaluated or is_over:
                 metrics = {
                     "return": mean(progress.returns),
                     "steps_per_second": speed(progress.frames),
                 }
                 progress.returns.clear()
-                if is_evaluation_due(progress.frames):
+                if is_evaluated:
                     metrics |= evaluate(evaluation_env, actor, config.evaluation, progress.frames)
                     speed(progress.frames)  # evaluation does not count
                 run.log({**scalars(losses), **metrics}, step=progress.frames)
@@ -150,6 +160,5 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    sys.argv += chosen_loss(sys.argv[1:])
     check_command_line(__file__, check_config)
     main()

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
-from contextlib import closing, suppress
+from collections.abc import Sequence
+from contextlib import closing
 from functools import partial
+from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import torch
 from omegaconf import DictConfig, OmegaConf
-from PIL import Image
 from score_sac import ScoreSACLoss
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
@@ -25,12 +24,10 @@ from torchrl.envs import (
     DMControlEnv,
     DoubleToFloat,
     EnvBase,
-    ExplorationType,
     GymWrapper,
     RewardSum,
     StepCounter,
     TransformedEnv,
-    set_exploration_type,
 )
 from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import DDPGLoss, LossModule, TargetNetUpdater, TD3Loss
@@ -50,7 +47,9 @@ from torchrl_ecpo import (
 from torchrl_ecpo._torchrl import carrier_of, generator_of, set_carrier
 from torchrl_ecpo.collectors import SupervisedAsyncCollector, SupervisedSyncCollector
 from torchrl_ecpo.collectors.workers import spawn_seeds
-from torchrl_ecpo.envs import EpisodeReplay, readable
+from torchrl_ecpo.envs import EpisodeReplay
+from torchrl_ecpo.experiment._tasks import missing, open_task
+from torchrl_ecpo.experiment._videos import greedy_episodes, save_gif, with_pixels
 from torchrl_ecpo.modules import (
     make_action_value_network,
     make_categorical_actor,
@@ -78,38 +77,38 @@ ACTORS = {
     "deterministic": make_deterministic_actor,
     "categorical": make_categorical_actor,
 }
+# Entries of loss that are not the loss's own arguments.
+OF_THE_SCRIPT = [
+    "name",
+    "actor",
+    "value_network",
+    "exploration",
+    "policy_delay",
+    "reference_interval",
+]
 TEMPERATURES = ("tau", "tau_prime")
 SHOWN = ("evaluation_return", "return", "entropy", "alpha", "tau", "tau_prime", "steps_per_second")
-LONGEST_EPISODE = 100_000
 
 
 def check_config(config: DictConfig, options: Sequence[str] = ()) -> None:
     """Refuse options that do not go together."""
-    if config.evaluation.interval % config.log_interval:
-        raise ValueError(
-            "evaluation.interval must be a multiple of log_interval, got "
-            f"{config.evaluation.interval} and {config.log_interval}."
-        )
-    if config.env.kind == "gym":
-        with closing(_make_gym(config.env)) as env:
-            make_actor(config, env)
-    if config.total_frames % config.log_interval:
-        raise ValueError(
-            "total_frames must be a multiple of log_interval, or the last frames would not be "
-            f"logged, got {config.total_frames} and {config.log_interval}."
-        )
+    with closing(make_environment(config, seed=config.seed)) as env:
+        make_actor(config, env)
 
 
 # ------------------------------------------------------------------------------------ environments
 
 
-def make_environment(config: DictConfig, *, seed: int, is_evaluation: bool = False) -> EnvBase:
-    """The task that ``env=`` names, with one vector as observation, in single precision."""
+def make_environment(config: DictConfig, *, seed: int, **pixels: Any) -> EnvBase:
+    """The task that ``env=`` names, with one vector as observation, in single precision.
+
+    Args:
+        config: of the run.
+        seed: of the episodes.
+        pixels: TorchRL's ``from_pixels`` and ``pixels_only``.
+    """
     make = {"gym": _make_gym, "dm_control": _make_dm_control}[config.env.kind]
-    if is_evaluation and config.evaluation.video:
-        env = _make_with_pixels(config.env, make)
-    else:
-        env = make(config.env, from_pixels=False)
+    env = make(config.env, **pixels)
     transforms: list[Any] = [DoubleToFloat(), RewardSum(), StepCounter(), EpisodeReplay()]
     if config.env.kind == "dm_control":
         parts = [key for key in list(env.observation_spec.keys()) if key != "pixels"]
@@ -119,51 +118,16 @@ def make_environment(config: DictConfig, *, seed: int, is_evaluation: bool = Fal
     return env
 
 
-def _make_with_pixels(config: DictConfig, make: Callable[..., EnvBase]) -> EnvBase:
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    try:
-        return make(config, from_pixels=True, pixels_only=False)
-    except Exception as error:  # of each renderer another
-        make(config, from_pixels=False).close()  # if it is not the renderer, this says what it is
-        is_ours = isinstance(error, (ModuleNotFoundError, ValueError))
-        reason = str(error.__cause__ if is_ours else error).rstrip(".")
-        hint = (
-            f"MuJoCo draws with OpenGL: MUJOCO_GL (now {os.environ['MUJOCO_GL']}) must be egl, "
-            "with libegl1 installed, osmesa, with libosmesa6, or on a desktop glfw."
-        )
-        raise RuntimeError(
-            f"evaluation.video=true cannot draw {config.name}: {reason}."
-            f" {'' if isinstance(error, ModuleNotFoundError) else hint}"
-        ) from error
+def make_evaluation_environment(config: DictConfig) -> EnvBase:
+    """One of its own, which draws where that is asked for."""
+    make = partial(make_environment, config, seed=config.seed + 1_000_000)
+    return with_pixels(config.env.title, make) if config.evaluation.video else make()
 
 
 def _make_gym(config: DictConfig, *, from_pixels: bool = False, **options: Any) -> EnvBase:
-    """A task of gymnasium, with spaces that the networks can read and play."""
-    try:
-        drawn: dict[str, Any] = {"render_mode": "rgb_array"} if from_pixels else {}
-        env = readable(gym.make(config.name, disable_env_checker=True, **drawn))
-    except (gym.error.DependencyNotInstalled, ModuleNotFoundError) as error:
-        raise _missing(config.name, error) from error
-    except gym.error.Error as error:
-        raise ValueError(
-            f"env.name={config.name} is no task of gymnasium: {error} If another module registers "
-            "it, name that too: env.name=module:Task-v0."
-        ) from error
-    except ValueError as error:
-        raise ValueError(f"env.name: {error}") from error
+    drawn: dict[str, Any] = {"render_mode": "rgb_array"} if from_pixels else {}
+    env = open_task(config.name, **drawn)
     return GymWrapper(env, categorical_action_encoding=True, from_pixels=from_pixels, **options)
-
-
-def chosen_loss(options: Sequence[str]) -> list[str]:
-    """The option ``loss=``, if none is given and a task of gymnasium takes one discrete action."""
-    given = {name: value for name, _, value in (option.partition("=") for option in options)}
-    if "loss" in given or given.get("env") != "gym":
-        return []
-    with suppress(gym.error.Error, ModuleNotFoundError, ValueError):  # which is said later
-        env = readable(gym.make(given.get("env.name", ""), disable_env_checker=True))
-        if isinstance(env.action_space, gym.spaces.Discrete):
-            return ["loss=discrete_ecac"]
-    return []
 
 
 def _make_dm_control(config: DictConfig, **options: Any) -> EnvBase:
@@ -173,16 +137,9 @@ def _make_dm_control(config: DictConfig, **options: Any) -> EnvBase:
     try:
         return DMControlEnv(config.name, config.task, **options)
     except ImportError as error:
-        raise _missing(task, error) from error
+        raise missing(task, error) from error
     except RuntimeError as error:
         raise ValueError(f"{task} cannot be made by dm_control: {error}") from error
-
-
-def _missing(task: str, error: Exception) -> ModuleNotFoundError:
-    return ModuleNotFoundError(
-        f"{task} needs what is not installed: {error} For MuJoCo and dm_control: "
-        "pip install '.[mujoco]' in the repository, likewise box2d and minigrid."
-    )
 
 
 # ------------------------------------------------------------------------------ networks and losses
@@ -211,10 +168,12 @@ def make_loss(config: DictConfig, actor: TensorDictModuleBase, env: EnvBase) -> 
         critics = [make_qvalue_network(_observation_size(env), action_spec.shape[-1], **sizes)]
     if config.loss.value_network:
         critics.append(make_value_network(_observation_size(env), **sizes))
-    options = {str(name): value for name, value in config.loss.options.items()}
+    options = {str(k): value for k, value in config.loss.items() if k not in OF_THE_SCRIPT}
     for name in TEMPERATURES:
         if isinstance(options.get(name), DictConfig):
             options[name] = make_schedule(_plain(options[name]))(0)
+    if options.get("tau_prime") == 0 and "target_entropy" in options:  # no entropy
+        options["target_entropy"] = None
     if "reference_interval" in config.loss:
         options["delay_actor"] = config.loss.reference_interval > 1
     if config.loss.name == "td3":
@@ -239,7 +198,7 @@ def compute_losses(
 
 def make_temperatures(config: DictConfig, loss_module: LossModule) -> TemperatureScheduler:
     """Schedules of the temperatures that have one, counted in frames."""
-    settings = {name: config.options.get(name) for name in TEMPERATURES}
+    settings = {name: config.get(name) for name in TEMPERATURES}
     schedules = {
         name: make_schedule(_plain(setting))
         for name, setting in settings.items()
@@ -264,14 +223,14 @@ def make_updater(config: DictConfig, loss_module: LossModule) -> TargetNetUpdate
 
 
 def make_optimizer(learning_rates: DictConfig, loss_module: LossModule) -> torch.optim.Optimizer:
-    """Adam, with a learning rate for each network and each learned temperature."""
+    """Adam, with a learning rate for each network and learned temperature that there is."""
     networks: dict[str, list[Tensor]] = {}
     for name, parameter in loss_module.named_parameters():
         owner = name.split(".")[0].removesuffix("_params")
         networks.setdefault(owner, []).append(parameter)
-    if networks.keys() != set(learning_rates):
+    if missing := networks.keys() - set(learning_rates):
         raise ValueError(
-            f"loss.lr must have a learning rate for each of {sorted(networks)}, got "
+            f"optim.lr must have a learning rate for each of {sorted(missing)}, got "
             f"{sorted(map(str, learning_rates))}."
         )
     groups: dict[float, list[Tensor]] = {}  # by rate: fewer groups are less overhead
@@ -315,8 +274,8 @@ def _plain(setting: DictConfig) -> Any:
 def make_collector(config: DictConfig, policy: TensorDictModuleBase) -> Any:
     """One collector in this process, or several in processes of their own."""
     options: dict[str, Any] = {
-        "frames_per_batch": config.collector.frames_per_batch,
-        "total_frames": config.total_frames,
+        "frames_per_batch": (batch := config.collector.frames_per_batch),
+        "total_frames": -(-config.total_frames // batch) * batch,  # whole batches
         "init_random_frames": config.collector.init_random_frames,
         "auto_register_policy_transforms": False,
     }
@@ -409,16 +368,13 @@ def finished_returns(transitions: TensorDictBase) -> list[float]:
     return transitions["next", "episode_reward"][transitions["next", "done"]].tolist()
 
 
-@torch.no_grad()
 def evaluate(
     env: EnvBase, actor: TensorDictModuleBase, config: DictConfig, frames: int
 ) -> dict[str, float]:
     """Mean return of whole episodes with the deterministic policy; a video of the first."""
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        episodes = [env.rollout(LONGEST_EPISODE, actor) for _ in range(config.episodes)]
+    episodes = greedy_episodes(env, actor, config.episodes)
     if config.video:
-        first, *others = (Image.fromarray(pixels.numpy()) for pixels in episodes[0]["pixels"])
-        first.save(f"evaluation_{frames}.gif", save_all=True, append_images=others)
+        save_gif(Path(f"evaluation_{frames}.gif"), episodes[0])
     returns = [episode["next", "episode_reward"][-1].item() for episode in episodes]
     return {"evaluation_return": mean(returns)}
 

@@ -6,6 +6,11 @@ and ``stack=[...]`` train several independent runs in one process (``stacked/``)
 
 from __future__ import annotations
 
+from torchrl_ecpo.experiment.options import check_command_line
+
+if __name__ == "__main__":  # before torch is imported, which takes seconds
+    check_command_line(__file__)
+
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -30,10 +35,11 @@ from utils import (
 )
 
 from torchrl_ecpo.collectors import shut_down
-from torchrl_ecpo.experiment import Checkpoints, Progress, check_command_line, compile_module
+from torchrl_ecpo.experiment import Checkpoints, Progress, compile_module, leaving_nothing
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
+@leaving_nothing
 def main(config: DictConfig) -> None:
     torch.set_num_threads(config.threads)
     if config.seeds is not None or config.stack is not None:
@@ -93,7 +99,7 @@ def main(config: DictConfig) -> None:
                 progress.trajectories += config.num_groups * config.group_size
                 progress.project_steps += 1
                 metrics = of_batch(of_steps) | task.measure(groups) | temperatures.values()
-                if progress.project_steps % config.evaluation_interval == 0:
+                if progress.project_steps % config.evaluation.interval == 0:
                     metrics |= task.evaluate(groups)
                 run.log(metrics, step=progress.trajectories)
                 watch(metrics)

@@ -1,20 +1,22 @@
 """Show how the policy of a run plays: ``python play.py runs/reverse/ecpo/seed_1/<time>``.
 
-It prints greedy episodes of an algorithmic task, a column for each step: what the policy reads,
-where it moves, what it writes; ``-`` is a blank.
+It prints the returns of greedy episodes, and draws the first one where the task can be drawn. Of an
+algorithmic task it prints the episodes, a column for each step: what the policy reads, where it
+moves, what it writes; ``-`` is a blank.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
 from stacked.policies import stack_policies
-from tasks import Task, greedy, is_solved, make_task
+from tasks import Task, greedy, is_solved, make_single, make_task
 from torchrl.checkpoint import CheckpointError
 from torchrl.envs import TransformedEnv
 from torchrl.modules import get_env_transforms_from_module
@@ -23,6 +25,7 @@ from utils import make_loss
 from torchrl_ecpo.checks import check_count
 from torchrl_ecpo.envs import AlgorithmicEnv
 from torchrl_ecpo.experiment import restore_part
+from torchrl_ecpo.experiment._videos import show
 
 MOVES = "<>^v"
 
@@ -74,21 +77,24 @@ def _tracks(episode: Any, symbols: str, solved: bool) -> Iterator[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print episodes."""
+    """Play, and say what came of it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, help="directory of a run")
-    parser.add_argument("--level", type=int, default=10, help="of the curriculum; default 10")
+    parser.add_argument("--level", type=int, default=10, help="of an algorithmic task; default 10")
     parser.add_argument("--episodes", type=int, default=2, help="default 2")
     options = parser.parse_args(arguments)
     try:
         check_count("--level", options.level)
         check_count("--episodes", options.episodes)
         config, task = load_run(options.run.resolve())
-        if config.env.kind != "algorithmic":
-            raise ValueError(
-                f"play.py shows the algorithmic tasks, got env.kind={config.env.kind}."
-            )
-        print("\n\n".join(episodes(config, task, options.level, options.episodes)))
+        if config.env.kind == "algorithmic":
+            print("\n\n".join(episodes(config, task, options.level, options.episodes)))
+        elif config.env.kind == "gym":
+            directory = options.run.resolve()
+            make = partial(make_single, config)
+            show(make, task.actor, options.episodes, directory, config.env.name)
+        else:  # one problem instance, in which greedy episodes are all alike
+            print(f"return {greedy(task.env, task.actor)[0, 0]['next', 'reward'].sum().item():g}")
     except (CheckpointError, FileNotFoundError, ValueError) as error:
         parser.error(str(error))
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
@@ -47,8 +46,8 @@ from torchrl_ecpo.envs import (
     DeepSeaEnv,
     EpisodeReplay,
     make_grouped_env,
-    readable,
 )
+from torchrl_ecpo.experiment._tasks import is_plain, open_task
 from torchrl_ecpo.modules import (
     PixelEncoder,
     SharedCategorical,
@@ -229,43 +228,16 @@ class Evaluation(nn.Module):
         }
 
 
-def make_raw_copy(name: str) -> gym.Env:
-    """A task of gymnasium, as it is."""
-    try:
-        return gym.make(name, disable_env_checker=True)
-    except (gym.error.DependencyNotInstalled, ModuleNotFoundError) as error:
-        raise ValueError(f"env.name={name} needs what is not installed: {error}") from error
-    except gym.error.Error as error:
-        raise ValueError(
-            f"env.name={name} is no task of gymnasium: {error} If another module registers it, "
-            "name that too: env.name=module:Task-v0."
-        ) from error
-
-
-def make_copy(name: str) -> gym.Env:
-    """A task of gymnasium, with spaces that the policy can read and play."""
-    try:
-        return readable(make_raw_copy(name))
-    except ValueError as error:
-        raise ValueError(f"env.name: {error}") from error
-
-
 def make_gym(config: DictConfig) -> Task:
     """A gymnasium task of any readable spaces, with a feed-forward policy."""
-
-    def make_torchrl_copy() -> EnvBase:
-        return GymWrapper(make_copy(config.env.name), categorical_action_encoding=True)
+    name, limited = config.env.name, partial(_limited, config)
 
     def make_evaluation_copy() -> EnvBase:
-        return TransformedEnv(make_torchrl_copy(), EpisodeReplay())
-
-    def limited(env: EnvBase) -> EnvBase:
-        transforms: list[Any] = [DoubleToFloat(), StepCounter(config.env.max_steps)]
-        return TransformedEnv(env, Compose(*transforms))
+        copy = GymWrapper(open_task(name), categorical_action_encoding=True)
+        return TransformedEnv(copy, EpisodeReplay())
 
     # By its id a task is played by its own vector entry point, if that can be.
-    raw = make_raw_copy(config.env.name)
-    source: Any = config.env.name if readable(raw) is raw else partial(make_copy, config.env.name)
+    source: Any = name if is_plain(name) else partial(open_task, name)
 
     def make_env(num_groups: int) -> EnvBase:
         sizes = {"num_groups": num_groups, "group_size": config.group_size}
@@ -274,7 +246,7 @@ def make_gym(config: DictConfig) -> Task:
     copies = SerialEnv(10, make_evaluation_copy)
     env, evaluation_env = make_env(config.num_groups), limited(copies)
     evaluation_env.set_seed(config.seed + 1_000_000)
-    actor = make_feed_forward_policy(env, config.env.hidden_sizes)
+    actor = make_feed_forward_policy(env, config.hidden_sizes)
 
     def measure(groups: TensorDictBase) -> Metrics:
         length = groups["collector", "mask"].sum(-1).float().mean()
@@ -293,9 +265,22 @@ def make_gym(config: DictConfig) -> Task:
         evaluate,
         shown,
         copies,
-        lambda: ValueOperator(feed_forward(env, 1, config.env.hidden_sizes)),
+        lambda: ValueOperator(feed_forward(env, 1, config.hidden_sizes)),
         least_entropy(env),
     )
+
+
+def make_single(config: DictConfig, *, from_pixels: bool = False, **options: Any) -> EnvBase:
+    """A gymnasium task of no batch size, to look at."""
+    drawn: dict[str, Any] = {"render_mode": "rgb_array"} if from_pixels else {}
+    env = open_task(config.env.name, **drawn)
+    options |= {"from_pixels": from_pixels, "categorical_action_encoding": True}
+    return _limited(config, GymWrapper(env, **options))
+
+
+def _limited(config: DictConfig, env: EnvBase) -> EnvBase:
+    transforms: list[Any] = [DoubleToFloat(), StepCounter(config.env.max_steps)]
+    return TransformedEnv(env, Compose(*transforms))
 
 
 def least_entropy(env: EnvBase) -> float:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
-from tasks import Metrics, Task, make_copy
+from tasks import Metrics, Task
 from tensordict import TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
@@ -31,6 +30,7 @@ from torchrl_ecpo import (
 )
 from torchrl_ecpo.collectors import TrajectoryGroupCollector
 from torchrl_ecpo.experiment import Run
+from torchrl_ecpo.experiment._tasks import is_plain
 from torchrl_ecpo.schedules import TemperatureScheduler, make_schedule
 
 LOSSES = {  # whose files in config/loss/ are older than the entry class
@@ -50,7 +50,7 @@ def check_config(config: DictConfig) -> None:
     """Refuse options that do not go together."""
     loss_class(config.loss)
     if config.env.kind == "gym":
-        check_copies(config.env.name)
+        is_plain(config.env.name)
     if config.compile and not (config.seeds is None and config.stack is None):
         raise ValueError(
             "compile=true is for single runs. Leave out compile, or seeds and stack: --multirun "
@@ -66,18 +66,6 @@ def check_config(config: DictConfig) -> None:
         raise ValueError(
             f"policy= is for the algorithmic tasks, got env.kind={config.env.kind!r}, which has a "
             "policy of its own. Leave out policy."
-        )
-
-
-@cache
-def check_copies(name: str) -> None:
-    """Refuse a task of gymnasium that cannot be played, or no two copies of which start alike."""
-    first, second = (make_copy(name).reset(seed=0)[0] for _ in range(2))
-    if not np.array_equal(first, second, equal_nan=True):
-        raise ValueError(
-            f"env.name={name}: two copies of a problem instance differ at their start, though they "
-            "are reset with one seed. It has to draw its start from self.np_random, which "
-            "super().reset(seed=seed) seeds."
         )
 
 

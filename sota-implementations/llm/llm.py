@@ -7,6 +7,11 @@ from __future__ import annotations
 
 from random import Random
 
+from torchrl_ecpo.experiment.options import check_command_line
+
+if __name__ == "__main__":  # before torch is imported, which takes seconds
+    check_command_line(__file__)
+
 import hydra
 import torch
 from omegaconf import DictConfig
@@ -14,12 +19,13 @@ from tasks import TASKS
 from torch.nn.utils import clip_grad_norm_
 from utils import Policy, check_model, make_loss, make_model
 
-from torchrl_ecpo.experiment import Checkpoints, Progress, Run, check_command_line
+from torchrl_ecpo.experiment import Checkpoints, Progress, Run, leaving_nothing
 
 SHOWN = ("pass_at_1", "pass_at_8", "pass_at_64", "distinct_right", "entropy")
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
+@leaving_nothing
 def main(config: DictConfig) -> None:
     torch.set_num_threads(config.threads)
     checkpoints = Checkpoints(config)

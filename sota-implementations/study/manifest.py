@@ -18,8 +18,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from torchrl_ecpo.experiment.options import compose_options
-from torchrl_ecpo.experiment.run import differences, flatten
+from torchrl_ecpo.experiment.options import compose_options, differences, flatten
 
 HERE = Path(__file__).resolve().parent
 SCRIPTS = HERE.parent
@@ -49,6 +48,10 @@ IMPLIED = {
     "policy.hidden_size": 128,
     "epochs": 1,
     "max_kl": "None",
+    # Of what is not learned, which had none.
+    "optim.lr.log_tau": 0.01,
+    "optim.lr.log_tau_prime": 0.0003,
+    "optim.lr.value_network": 0.0003,
 }
 
 Entry = TypeVar("Entry")
@@ -164,7 +167,7 @@ def identity(config: DictConfig) -> dict[str, float | str]:
     """The entries of a configuration that determine the numbers of a run, but for its length."""
     values = flatten(OmegaConf.to_container(config, resolve=True))
     return {
-        name: value
+        present(name): value
         for name, value in values.items()
         if not _is_below(name, NOT_THE_RUN) and not name.split(".")[-1].startswith("total_")
     }
@@ -179,9 +182,38 @@ def changed_entries(
         >>> changed_entries({"tau": 0.5, "a.b": 1}, {"tau": 0.1}, ignored=["a"])
         ['tau was 0.5, is 0.1']
     """
-    changes = differences({**IMPLIED, **old}, {**IMPLIED, **new})
-    ignored = (*NOT_THE_RUN, *ignored)
+    old, new = (
+        {**IMPLIED, **{present(k): v for k, v in run.items() if not _is_below(k, NOT_THE_RUN)}}
+        for run in (old, new)
+    )
+    changes = differences(old, new)
     return [words for name, words in changes.items() if not _is_below(name, ignored)]
+
+
+@cache
+def present(text: str) -> str:
+    """What names an option, or several, as when a run was made, with the names of today.
+
+    Examples:
+        >>> present("loss=ecac loss.options.tau=0.1 ~loss.lr.log_tau")
+        'loss=ecac loss.tau=0.1'
+    """
+    text = re.sub(r" ~\S+", "", text)  # learning rates of what is not learned, which may stay now
+    for old, new in _former_names().items():
+        text = re.sub(rf"(?<![\w.]){re.escape(old)}(?=[.= ]|$)", new, text)
+    return text
+
+
+@cache
+def _former_names() -> dict[str, str]:
+    """Of each script, what its ``options.yaml`` says ``now ...``."""
+    kinds = [yaml.safe_load(file.read_text()) for file in sorted(SCRIPTS.glob("*/options.yaml"))]
+    return {
+        old: kind.removeprefix("now ")
+        for own in kinds
+        for old, kind in own.items()
+        if kind.startswith("now ")
+    }
 
 
 def _is_below(name: str, entries: Iterable[str]) -> bool:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from manifest import SCRIPTS, Cell, Manifest, Study, changed_entries
+from manifest import SCRIPTS, Cell, Manifest, Study, changed_entries, present
 from records import Record
 
 from torchrl_ecpo.experiment.compare import Curve, align, final
@@ -48,7 +48,8 @@ class Results:
         curves = {
             key: [_point(row) for row in rows] for key, rows in itertools.groupby(points, _key)
         }
-        return cls(directory, runs, curves, json.loads((directory / "configs.json").read_text()))
+        configs = json.loads((directory / "configs.json").read_text())
+        return cls(directory, runs, curves, {present(cell): own for cell, own in configs.items()})
 
     def write(self) -> None:
         """Write the files, in an order that depends on nothing but their content."""
@@ -172,12 +173,12 @@ def read_cells(manifest: Manifest, study: Study, results: Path = RESULTS) -> lis
 
 def read_cell(cell: Cell, results: Results) -> CellResult:
     """The results of a cell; a run with other options than the cell's now is none of it."""
-    options, complete, unfinished = " ".join(cell.options), {}, 0
+    options, complete, unfinished = present(" ".join(cell.options)), {}, 0
     curves = {}
     for seed in cell.seeds:
         key = (cell.task.name, cell.method, cell.label, seed)
         run = results.runs.get(key)
-        if run is None or run["options"] != options:
+        if run is None or present(run["options"]) != options:
             continue
         if recorded(run) < cell.steps:
             unfinished += 1
@@ -236,7 +237,7 @@ def _but_for_the_seed(identity: Mapping[str, float | str]) -> dict[str, float | 
 
 
 def _key(row: Mapping[str, str]) -> Key:
-    return row["task"], row["method"], row["setting"], int(row["seed"])
+    return row["task"], row["method"], present(row["setting"]), int(row["seed"])
 
 
 def _point(row: Mapping[str, str]) -> Point:

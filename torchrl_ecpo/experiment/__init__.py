@@ -1,9 +1,14 @@
 """What every script needs and no loss knows: run directories, loggers, curves and figures."""
 
-from torchrl_ecpo.experiment.checkpoint import Checkpoints, Progress, restore_part
-from torchrl_ecpo.experiment.compiling import compile_module
-from torchrl_ecpo.experiment.options import check_command_line, check_options, compose_options
-from torchrl_ecpo.experiment.run import MetricsTable, Run, read_metrics
+from typing import TYPE_CHECKING
+
+from torchrl_ecpo._lazy import importing
+
+if TYPE_CHECKING:
+    from torchrl_ecpo.experiment.checkpoint import Checkpoints, Progress, restore_part
+    from torchrl_ecpo.experiment.compiling import compile_module
+    from torchrl_ecpo.experiment.options import check_command_line, check_options, compose_options
+    from torchrl_ecpo.experiment.run import MetricsTable, Run, leaving_nothing, read_metrics
 
 __all__ = [
     "Checkpoints",
@@ -14,6 +19,9 @@ __all__ = [
     "check_options",
     "compile_module",
     "compose_options",
+    "leaving_nothing",
     "read_metrics",
     "restore_part",
 ]
+
+__getattr__ = importing(__name__, "checkpoint", "compiling", "options", "run")

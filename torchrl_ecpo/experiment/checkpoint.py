@@ -15,7 +15,6 @@ from pathlib import Path
 from types import FrameType, SimpleNamespace, TracebackType
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.utils import to_absolute_path
 from omegaconf import DictConfig, OmegaConf
@@ -24,7 +23,8 @@ from torchrl.checkpoint import Checkpoint, CheckpointError, GlobalRNGState
 
 from torchrl_ecpo.checks import check_count
 from torchrl_ecpo.experiment._files import StateFile, check_files, read_manifest, seal
-from torchrl_ecpo.experiment.run import Run, differences, flatten
+from torchrl_ecpo.experiment.options import differences, flatten
+from torchrl_ecpo.experiment.run import Run, command_line
 
 __all__ = ["Checkpoints", "Progress", "restore_part"]
 
@@ -115,9 +115,11 @@ class Checkpoints:
             self._saved = manifest["metadata"]
             differing = _differences(self._saved["config"], self.config)
             if differing:
+                more = [f"and {len(differing) - 5} more"] * (len(differing) > 5)
                 raise CheckpointError(
-                    f"The configuration differs from that of {source}: {'; '.join(differing)}. "
-                    "Resume with the options that the run was started with."
+                    f"The configuration differs from that of {source}: "
+                    f"{'; '.join([*differing[:5], *more])}. Resume with the options that the run "
+                    "was started with, and the version of the script."
                 )
             check_files(source, manifest)
         except OSError as error:
@@ -250,14 +252,11 @@ class Checkpoints:
     @property
     def command(self) -> str:
         """What a user types to resume."""
-        overrides: list[str] = []
-        if HydraConfig.initialized():
-            overrides = list(HydraConfig.get().overrides.task)
-        kept = [option for option in overrides if not option.lstrip("+").startswith("resume=")]
+        kept = [each for each in command_line() if not each.lstrip("+").startswith("resume=")]
         directory = str(self.directory)
         if not re.fullmatch(r"[\w./-]+", directory):  # hydra has a meaning for commas, for one
             directory = QuotedString(directory, Quote.single).with_quotes()
-        return shlex.join(["python", sys.argv[0], *kept, f"resume={directory}"])
+        return shlex.join([*kept, f"resume={directory}"])
 
     def __enter__(self) -> Checkpoints:
         """Take over SIGTERM and SIGINT."""
@@ -288,7 +287,9 @@ class Checkpoints:
         self._restore_handlers()
         if error is None:
             self.save(finished=True)
-        elif isinstance(error, (ChildProcessError, FloatingPointError, ValueError)):
+        elif self.run.table.rows and isinstance(
+            error, (ChildProcessError, FloatingPointError, ValueError)
+        ):
             try:
                 self.save()
             except (FloatingPointError, CheckpointError) as refused:
@@ -333,17 +334,12 @@ def run_directory(resume: str | None, parent: str, name: str) -> str:
         resume: None, a run directory, or ``"auto"``: the last one in `parent` with a checkpoint.
         parent: of run directories, whose names sort by age.
         name: of a new run directory.
-
-    Raises:
-        FileNotFoundError: if the run directory does not exist.
     """
     if resume is None:
         return f"{parent}/{name}"
     if resume == "auto":
         runs = sorted({path.parents[1] for path in Path(parent).glob(f"*/{FOLDER}/checkpoint-*")})
         return str(runs[-1] if runs else Path(parent, name))
-    if not Path(resume).is_dir():
-        raise FileNotFoundError(f"resume={resume}: there is nothing to resume from, no directory.")
     return str(Path(resume).absolute())
 
 

@@ -1,37 +1,47 @@
-"""The options of a script, checked against its defaults before hydra makes a run directory."""
+"""The options of a script, checked against its defaults before hydra makes a run directory.
+
+Nothing here imports torch, so that ``--help`` and most refusals come at once.
+"""
 
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import operator
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import nullcontext
+import sys
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from difflib import SequenceMatcher
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from hydra.main import get_args_parser  # pyright: ignore[reportPrivateImportUsage]
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-
-from torchrl_ecpo.experiment.run import flatten
-from torchrl_ecpo.schedules import make_schedule
 
 __all__ = ["check_command_line", "check_options", "compose_options", "expand", "parse"]
 
 _LIMITS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
+_EXPONENTIAL = re.compile(r"(?<![\w./'\"-])\d+(?:\.\d+)?[eE]\+?\d+(?![\w./])")
+_FLAGS = "--multirun: each combination of seed=0,1 loss=ecpo,ment; --hydra-help: further flags"
+
+Check = Callable[[DictConfig, Sequence[str]], object]
 
 
-def check_command_line(script: str, check: Callable[[DictConfig, Sequence[str]], object]) -> None:
-    """Refuse a command line that is wrong, as the first thing that a script does.
+def check_command_line(script: str, check: Check | None = None) -> None:
+    """Answer ``--help``, and refuse a command line that is wrong, before anything is made.
+
+    A script calls it first without `check`, and once more when all is imported that `check` needs.
 
     Args:
         script: its path.
@@ -39,22 +49,43 @@ def check_command_line(script: str, check: Callable[[DictConfig, Sequence[str]],
             it is composed of. Raises ValueError.
 
     Raises:
-        SystemExit: naming the option, what was expected, and what came.
+        SystemExit: naming each option that is wrong, what was expected, and what came.
     """
+    sys.argv[1:] = map(_whole, sys.argv[1:])
     flags = get_args_parser().parse_args()
-    if any((flags.help, flags.hydra_help, flags.cfg, flags.info, flags.shell_completion)):
+    if any((flags.hydra_help, flags.cfg, flags.info, flags.shell_completion)):
         return  # nothing is run
     options, folder = flags.overrides, Path(script).resolve().parent
+    name = flags.config_name or "config"
     if flags.config_dir:
         options.append(f"hydra.searchpath=['{Path(flags.config_dir).absolute()}']")
+    problems: dict[str, None] = {}  # of several runs, each once
+    with _noting(problems), _initialized(folder / (flags.config_path or "config")):
+        for run in [options] if flags.help else expand(options):
+            with _noting(problems):
+                config = compose_options(folder, run, name)
+                if flags.help:
+                    print(_help(folder / "config", config, options, name))
+                    raise SystemExit
+                resume = config.get("resume")
+                if resume not in (None, "auto") and not Path(resume).is_dir():
+                    raise ValueError(f"resume={resume}: there is no such directory.")
+                if check is not None:
+                    check(config, run)
+    if problems:
+        raise SystemExit("\n".join(f"{Path(script).name}: {problem}" for problem in problems))
+
+
+@contextmanager
+def _noting(problems: dict[str, None]) -> Iterator[None]:
     try:
-        with _initialized(folder / (flags.config_path or "config")):
-            for run in expand(options):
-                check(compose_options(folder, run, flags.config_name or "config"), run)
-    except (ValueError, HydraException, OmegaConfBaseException) as error:
+        yield
+    except (ValueError, ImportError) as error:
+        problems |= dict.fromkeys(str(error).splitlines())
+    except (HydraException, OmegaConfBaseException) as error:
         # Of hydra's lines without where it looked, and its advice to add a group.
         message = re.split(r"\n(?:Config search path|To append)", str(error))[0]
-        raise SystemExit(f"{Path(script).name}: {' '.join(message.split())}") from None
+        problems[" ".join(message.split())] = None
 
 
 def _initialized(config: Path) -> Any:
@@ -99,25 +130,58 @@ def compose_options(folder: Path, options: Sequence[str], name: str = "config") 
         ValueError: for an option that does not exist, or whose value is of another kind.
         HydraException: for what hydra refuses.
     """
-    file = folder.resolve() / "options.yaml"
+    file, options = folder.resolve() / "options.yaml", [*map(_whole, options)]
     kinds: Any = OmegaConf.to_container(OmegaConf.load(file)) if file.is_file() else {}
     is_running = GlobalHydra.instance().is_initialized()  # within hydra.main
     with nullcontext() if is_running else _initialized(file.parent / "config"):
         groups = GlobalHydra.instance().config_loader().list_groups("")
-        chosen, values = [], []
+        chosen, values, problems = [], [], []
         for own in parse(options):
-            is_choice = own.key_or_group in groups or own.key_or_group.startswith("hydra")
-            (chosen if is_choice else values).append(str(own.input_line))
+            key, line = own.key_or_group, str(own.input_line)
+            if (present := renamed(key, kinds)) != key:
+                problems.append(f"{key} is called {present}.")
+            elif key in groups or key.startswith("hydra"):
+                chosen.append(line)
+            else:
+                values.append(line)
         defaults = _defaults(file, name, tuple(chosen))
         try:
-            config = compose(name, list(options))
+            config = compose(name, [*chosen, *values]) if values else defaults
         except HydraException:
             # What it does not know it advises to add.
-            added = [line if line[0] == "~" else f"++{line.lstrip('+')}" for line in values]
-            check_options(compose(name, [*chosen, *added]), defaults, kinds, groups)
-            raise
-        check_options(config, defaults, kinds, groups)
+            added = [f"++{line.lstrip('+')}" for line in values if line[0] != "~"]
+            config = compose(name, [*chosen, *added])
+            problems += _problems(config, defaults, kinds, groups)
+            if not problems:
+                raise
+        else:
+            problems += _problems(config, defaults, kinds, groups)
+        if problems:
+            raise ValueError("\n".join(problems))
         return config
+
+
+def renamed(name: str, kinds: Mapping[str, str]) -> str:
+    """The present name of an option: of what ``options.yaml`` says ``now ...``, that.
+
+    Examples:
+        >>> renamed("loss.options.tau", {"loss.options": "now loss"})
+        'loss.tau'
+    """
+    for old, kind in kinds.items():
+        if kind.startswith("now ") and f"{name}.".startswith(f"{old}."):
+            return kind.removeprefix("now ") + name.removeprefix(old)
+    return name
+
+
+def _whole(option: str) -> str:
+    """An option in which 1e4 is an integer, as no number that hydra reads with an exponent is."""
+
+    def written(number: re.Match[str]) -> str:
+        value = float(number[0])
+        return str(int(value)) if value.is_integer() else number[0]
+
+    return _EXPONENTIAL.sub(written, option)
 
 
 @cache
@@ -143,11 +207,11 @@ def check_options(
         kinds: what else options take, by name: kinds and words, with ``or`` between them. A kind is
             ``an integer`` or ``a number``, with limits (``a number > 0 and <= 1``), ``text``,
             ``a mapping``, ``a schedule`` or ``anything``; a word is taken as it is (``null``).
-            ``nothing`` says that the option may be missing.
+            ``now NAME`` says what an option is called that had another name.
         groups: further names that a user may have meant.
 
     Raises:
-        ValueError: naming the option, what was expected, and what came.
+        ValueError: with a line for each: the option, what was expected, and what came.
 
     Examples:
         >>> defaults = OmegaConf.create({"compile": False, "optim": {"lr": 0.1}})
@@ -162,57 +226,69 @@ def check_options(
             ...
         ValueError: There is no option optim.learnrate; the nearest one is optim.lr.
     """
-    defaults = defaults.copy()
+    problems = [*_problems(config, defaults, kinds, groups)]
+    if problems:
+        raise ValueError("\n".join(problems))
+
+
+def _problems(
+    config: DictConfig, defaults: DictConfig, kinds: Mapping[str, str], groups: Collection[str]
+) -> Iterator[str]:
+    """All that is wrong, in a line each."""
+    config, defaults = config.copy(), defaults.copy()
     unresolved = (flatten(OmegaConf.to_container(each)) for each in (config, defaults))
-    given, usual = ({name for name in each if each[name] == "???"} for each in unresolved)
-    if given:
-        raise ValueError(f"{min(given)} must be given.")
+    missing, usual = ({name for name in each if each[name] == "???"} for each in unresolved)
+    for name in sorted(missing):
+        yield f"{name} must be given."
+        OmegaConf.update(config, name, None)
     for name in usual:  # which may say what others are
         OmegaConf.update(defaults, name, OmegaConf.select(config, name))
     given, usual = (OmegaConf.to_container(each, resolve=True) for each in (config, defaults))
     names = [name.split(".") for name in flatten(usual)]
     known = [".".join(parts[: i + 1]) for parts in names for i in range(len(parts))]
-    _check_below("", given, usual, kinds, [*known, *groups])
+    kinds = {**kinds, **dict.fromkeys(missing, "anything")}
+    yield from _problems_below("", given, usual, kinds, [*known, *groups])
 
 
-def _check_below(
+def _problems_below(
     parent: str, values: Any, defaults: Any, kinds: Mapping[str, str], known: Collection[str]
-) -> None:
-    """Check the entries of a mapping; without defaults, it has those that have a kind."""
+) -> Iterator[str]:
+    """Of the entries of a mapping; without defaults, it has those that have a kind."""
     named = [name.removeprefix(parent) for name in kinds if name.startswith(parent)]
     usual = dict.fromkeys(named) if defaults is None else defaults
     for key in {**usual, **values}:
         name = f"{parent}{key}"
-        may_be_absent = kinds.get(name, "").endswith("or nothing")
-        if key not in usual and not may_be_absent:
-            wrong = next(iter(flatten(values[key], f".{name}")))
-            nearest = max(known, key=lambda other: _likeness(wrong, other))
-            raise ValueError(f"There is no option {wrong}; the nearest one is {nearest}.")
-        if key in values:
-            _check(name, values[key], usual.get(key), kinds, known)
-        elif not may_be_absent:
-            raise ValueError(f"{name} must be given.")
+        if key not in usual:
+            for wrong in flatten(values[key], f".{name}"):
+                nearest = max(known, key=lambda other, wrong=wrong: _likeness(wrong, other))
+                yield f"There is no option {wrong}; the nearest one is {nearest}."
+        elif key in values:
+            yield from _problems_of(name, values[key], usual[key], kinds, known)
+        else:
+            yield f"{name} must be given."
 
 
-def _check(
+def _problems_of(
     name: str, value: Any, default: Any, kinds: Mapping[str, str], known: Collection[str]
-) -> None:
+) -> Iterator[str]:
     kind = kinds.get(name) or _kind_of(default)
     fitting = [one for one in kind.split(" or ") if _fits(value, one)]
     if not fitting:
-        raise ValueError(f"{name} must be {kind}, got {value!r}.")
-    if fitting[0] == "a mapping":
-        _check_below(f"{name}.", value, default, kinds, known)
-    elif fitting[0] == "a schedule":
+        yield f"{name} must be {kind}, got {value!r}."
+    elif fitting[0] == "a mapping":
+        yield from _problems_below(f"{name}.", value, default, kinds, known)
+    elif fitting[0] == "a schedule" and value != default:
+        from torchrl_ecpo.schedules import make_schedule  # with torch
+
         for key in value.keys() - {"schedule"}:
-            _check(f"{name}.{key}", value[key], 0.0, {}, known)
+            yield from _problems_of(f"{name}.{key}", value[key], 0.0, {}, known)
         try:
             make_schedule(value)
         except ValueError as error:
-            raise ValueError(f"{name}: {error}") from None
+            yield f"{name}: {error}"
     elif fitting[0] == "a list" and default:
         for index, item in enumerate(value):
-            _check(f"{name}[{index}]", item, default[0], kinds, known)
+            yield from _problems_of(f"{name}[{index}]", item, default[0], kinds, known)
 
 
 def _kind_of(default: Any) -> str:
@@ -242,3 +318,89 @@ def _likeness(name: str, other: str) -> float:
     """How alike two names are, and what they end in."""
     pairs = ((name, other), (name.split(".")[-1], other.split(".")[-1]))
     return sum(SequenceMatcher(None, *pair).ratio() for pair in pairs)
+
+
+def flatten(config: object, prefix: str = "") -> dict[str, float | str]:
+    """A nested configuration as ``{"loss.tau": 0.5, ...}``, which is all TensorBoard takes."""
+    if isinstance(config, Mapping):
+        parts = (flatten(value, f"{prefix}.{name}") for name, value in config.items())
+        return {name: value for part in parts for name, value in part.items()}
+    is_plain = isinstance(config, (bool, int, float, str))
+    return {prefix.removeprefix("."): config if is_plain else str(config)}
+
+
+def differences(old: Mapping[str, object], new: Mapping[str, object]) -> dict[str, str]:
+    """What differs between two flat configurations, in words, by the name of the entry.
+
+    Examples:
+        >>> differences({"tau": 0.5, "a.b": 1}, {"tau": 0.1, "a.b": 1})
+        {'tau': 'tau was 0.5, is 0.1'}
+    """
+    return {
+        name: f"{name} was {old.get(name, 'absent')}, is {new.get(name, 'absent')}"
+        for name in sorted(old.keys() | new.keys())
+        if name not in old or name not in new or old[name] != new[name]
+    }
+
+
+# -------------------------------------------------------------------------------------------- help
+
+
+def _help(configs: Path, config: DictConfig, options: Sequence[str], name: str) -> str:
+    """What ``--help`` prints: the choices, and each option as it is with those that are made."""
+    lines = [_comment(configs / f"{name}.yaml", whole=True)]
+    for group in sorted(path for path in configs.iterdir() if [*path.glob("*.yaml")]):
+        lines += ["", f"{group.name}="]
+        lines += [f"  {path.stem:18} {_comment(path)}" for path in sorted(group.glob("*.yaml"))]
+    words, rows = _words(configs, options, name), _rows(OmegaConf.to_container(config))
+    lines += ["", "Options, as they are with these choices:"]
+    lines += [f"  {f'{key}={value}':42} {words.get(key, '')}".rstrip() for key, value in rows]
+    return "\n".join([*lines, "", _FLAGS])
+
+
+def _comment(file: Path, *, whole: bool = False) -> str:
+    """The first line of what a configuration says of itself, or all."""
+    lines = file.read_text().removeprefix("# @package _global_\n").splitlines()
+    comment = [*itertools.takewhile(lambda line: line.startswith("#"), lines)]
+    return "\n".join(line[2:] for line in (comment if whole else comment[:1]))
+
+
+def _words(configs: Path, options: Sequence[str], name: str) -> dict[str, str]:
+    """What stands behind the options, in the files that a configuration is composed of."""
+    loader: Any = GlobalHydra.instance().config_loader()
+    words: dict[str, str] = {}
+    for default in loader.compute_defaults_list(name, list(options), RunMode.RUN).defaults:
+        file = configs / f"{default.config_path}.yaml"
+        if file.is_file():
+            lines = file.read_text().splitlines()
+            parent = "" if default.package in ("", "_global_") else f"{default.package}."
+            words |= {
+                f"{parent}{key}": word
+                for key, line in _lines(yaml.compose("\n".join(lines)))
+                if (word := lines[line].partition(" # ")[2])
+            }
+    return words
+
+
+def _lines(node: Any) -> Iterator[tuple[str, int]]:
+    """The names in a mapping, and below, and the lines on which they are."""
+    for key, value in node.value if isinstance(node, yaml.MappingNode) else ():
+        yield key.value, key.start_mark.line
+        yield from ((f"{key.value}.{name}", line) for name, line in _lines(value))
+
+
+def _rows(config: Any, parent: str = "") -> Iterator[tuple[str, str]]:
+    for key, value in config.items():
+        if isinstance(value, dict) and not value.keys() & {"schedule", "metric"}:  # one value
+            yield from _rows(value, f"{parent}{key}.")
+        else:
+            yield f"{parent}{key}", _written(value)
+
+
+def _written(value: Any) -> str:
+    """A value as it is typed."""
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{key}:{_written(own)}" for key, own in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ",".join(map(_written, value)) + "]"
+    return value if isinstance(value, str) else json.dumps(value)

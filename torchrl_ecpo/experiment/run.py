@@ -10,27 +10,36 @@ import json
 import math
 import os
 import platform
+import shlex
+import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import wraps
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from hydra.utils import to_absolute_path
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.checkpoint import CheckpointError
 from torchrl.record.loggers import Logger, get_logger
 from tqdm import tqdm
 
 from torchrl_ecpo.checks import as_float, check_choice
 from torchrl_ecpo.experiment.figures import plot_learning_curve
+from torchrl_ecpo.experiment.options import flatten
 
-__all__ = ["METRICS_FILE", "MetricsTable", "Run", "read_metrics"]
+__all__ = ["METRICS_FILE", "MetricsTable", "Run", "leaving_nothing", "read_metrics"]
 
 METRICS_FILE = "metrics.csv"
 """Name of the record in the directory of a run."""
+BEGUN = {"config.yaml", "versions.json", "command.txt"}
 BACKENDS = ("csv", "tensorboard", "wandb")
 RECORDED_PACKAGES = ("torchrl-ecpo", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
 
@@ -190,9 +199,9 @@ def read_metrics(run_directory: Path | str) -> dict[str, list[float]]:
 class Run:
     """A training run in the current directory: record, loggers, progress bar, picture.
 
-    Writes ``config.yaml``, ``versions.json``, ``metrics.csv`` as it goes, and at the end
-    ``summary.json`` and ``curve.png``, if any of ``shown`` was measured. Use it as a context
-    manager; a run that is interrupted keeps its record and still draws its picture.
+    Writes ``config.yaml``, ``versions.json`` and ``command.txt``, ``metrics.csv`` as it goes, and
+    at the end ``summary.json`` and ``curve.png``, if any of ``shown`` was measured. Use it as a
+    context manager; a run that is interrupted keeps its record and still draws its picture.
 
     Args:
         config: the composed configuration; needs ``seed`` and ``logger`` with ``backend``
@@ -246,6 +255,8 @@ class Run:
         OmegaConf.save(config, self.directory / "config.yaml.part", resolve=True)
         os.replace(self.directory / "config.yaml.part", self.directory / "config.yaml")
         _write_json(self.directory / "versions.json", _versions())
+        with (self.directory / "command.txt").open("a" if config.get("resume") else "w") as file:
+            file.write(f"{shlex.join(command_line())}\n")
         self.table = MetricsTable(self.directory / METRICS_FILE)
         self._logger = None if config.logger.backend == "csv" else self._make_logger(config)
         self._bar = tqdm(
@@ -359,37 +370,70 @@ class Run:
             print(f"{self.name}: learning curve in {picture}")
 
 
-def flatten(config: object, prefix: str = "") -> dict[str, float | str]:
-    """A nested configuration as ``{"loss.tau": 0.5, ...}``, which is all TensorBoard takes."""
-    if isinstance(config, Mapping):
-        parts = (flatten(value, f"{prefix}.{name}") for name, value in config.items())
-        return {name: value for part in parts for name, value in part.items()}
-    is_plain = isinstance(config, (bool, int, float, str))
-    return {prefix.removeprefix("."): config if is_plain else str(config)}
+def command_line() -> list[str]:
+    """What a user has typed; of a sweep, what starts this run alone."""
+    options = HydraConfig.get().overrides.task if HydraConfig.initialized() else sys.argv[1:]
+    return ["python", sys.argv[0], *options]
 
 
-def differences(old: Mapping[str, object], new: Mapping[str, object]) -> dict[str, str]:
-    """What differs between two flat configurations, in words, by the name of the entry.
+def leaving_nothing(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
+    """A script's ``main`` that leaves nothing behind if it fails before a run has its first row.
 
-    Examples:
-        >>> differences({"tau": 0.5, "a.b": 1}, {"tau": 0.1, "a.b": 1})
-        {'tau': 'tau was 0.5, is 0.1'}
+    What is wrong with the options is then said in one line; HYDRA_FULL_ERROR=1 has the traceback.
     """
-    return {
-        name: f"{name} was {old.get(name, 'absent')}, is {new.get(name, 'absent')}"
-        for name in sorted(old.keys() | new.keys())
-        if name not in old or name not in new or old[name] != new[name]
-    }
+
+    @wraps(main)
+    def run(config: DictConfig) -> None:
+        try:
+            main(config)
+        except (ValueError, LookupError, OSError, ImportError, CheckpointError) as error:
+            is_alone = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.RUN
+            if _clear() and is_alone and "HYDRA_FULL_ERROR" not in os.environ:
+                message = error.args[0] if isinstance(error, KeyError) else error
+                raise SystemExit(f"{Path(sys.argv[0]).name}: {message}") from None
+            raise
+
+    return run
+
+
+def _clear() -> bool:
+    """Remove the directory of a run that has only begun; whether it was one."""
+    here = Path.cwd()
+    files = [path for path in here.rglob("*") if path.is_file()]
+    is_begun = all(path.name in BEGUN for path in files)
+    if is_begun:
+        for path in files:
+            path.unlink()
+        below = sorted(here.rglob("*"), reverse=True)
+        for folder in (*below, here, *here.parents):
+            if folder == Path(to_absolute_path(".")) or any(folder.iterdir()):
+                break
+            folder.rmdir()
+    return is_begun
 
 
 def _versions() -> dict[str, str]:
     versions = {"python": platform.python_version(), "platform": platform.platform()}
+    versions["commit"] = _commit()
     for package in RECORDED_PACKAGES:
         try:
             versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             versions[package] = "not installed"
     return versions
+
+
+def _commit() -> str:
+    """That of the script's repository, with ``-dirty`` if files differ from it."""
+    command = ["git", "--no-optional-locks", "describe", "--always", "--dirty", "--abbrev=40"]
+    folder = Path(to_absolute_path(sys.argv[0])).parent
+    with suppress(OSError):  # no git
+        done = subprocess.run(
+            [*command, "--exclude=*"], cwd=folder, capture_output=True, text=True, check=False
+        )
+        if done.returncode == 0:
+            return done.stdout.strip()
+    return "unknown"
 
 
 def _write_json(path: Path, content: Mapping[str, object]) -> None:

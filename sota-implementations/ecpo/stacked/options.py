@@ -10,14 +10,13 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from utils import check_config, has_value_network
 
-from torchrl_ecpo.experiment.options import compose_options, expand, parse
-from torchrl_ecpo.experiment.run import flatten
+from torchrl_ecpo.experiment.options import compose_options, expand, flatten, parse
 
 FOLDER = Path(__file__).parents[1]
 KINDS = ("algorithmic", "bandit")
 MAY_DIFFER = (
     *("seed", "loss", "optim", "project_steps", "epochs", "max_kl"),
-    *("anneal_from", "stop_when", "evaluation_interval", "env.curriculum", "env.instance_seed"),
+    *("anneal_from", "stop_when", "evaluation", "env.curriculum", "env.instance_seed"),
 )
 
 
@@ -81,7 +80,7 @@ def _is_list(value: Any, kind: type) -> bool:
 
 
 def _check_together(runs: Sequence[DictConfig]) -> None:
-    """Refuse runs that cannot share a collector, or do not end together."""
+    """Refuse runs that cannot share a collector."""
     first = runs[0]
     if first.collector.backend != "direct":
         raise ValueError(
@@ -106,10 +105,3 @@ def _check_together(runs: Sequence[DictConfig]) -> None:
                 f"Stacked runs must agree in {name}, got {' and '.join(values)}. They may differ "
                 f"in {', '.join(MAY_DIFFER)}."
             )
-    lifts = {run.num_groups * run.group_size * run.project_steps for run in runs}
-    if len({-(-first.total_trajectories // size) * size for size in lifts}) > 1:
-        raise ValueError(
-            f"total_trajectories={first.total_trajectories} is rounded up to whole projections, "
-            f"which have {' and '.join(map(str, sorted(lifts)))} trajectories: stacked runs must "
-            "end together, so give a multiple of these."
-        )

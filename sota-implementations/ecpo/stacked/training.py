@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import dataclass, field
+from math import lcm
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,10 @@ KEYS_OF_LOSSES = ("action", "action_log_prob", MASK_KEY, GROUP_KEY, ("next", "re
 def train_stack(configs: Mapping[str, DictConfig], checkpoints: Checkpoints) -> None:
     """Train the runs, by the name of their directory, together."""
     stack = Stack(configs)
-    total = stack.members[0].config.total_trajectories
+    runs = [member.config for member in stack.members]
+    # Whole projections of each.
+    lift = lcm(*(c.num_groups * c.group_size * c.project_steps for c in runs))
+    total = -(-runs[0].total_trajectories // lift) * lift
     with shut_down(stack.collector), ExitStack() as open_runs:
         for member in stack.members:
             open_runs.enter_context(member.run)
@@ -167,7 +171,7 @@ class Stack:
             member = self.members[index]
             metrics = of_batch(of_steps[index]) | member.task.measure(part)
             metrics |= member.temperatures.values()
-            if self.progress.project_steps % member.config.evaluation_interval == 0:
+            if self.progress.project_steps % member.config.evaluation.interval == 0:
                 with self.collector.policy.streams.drawing_from(index):
                     metrics |= member.task.evaluate(part)
             member.metrics = metrics

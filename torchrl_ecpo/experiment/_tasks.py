@@ -1,0 +1,70 @@
+"""Tasks of gymnasium for the scripts, by the id that ``env.name`` is."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from functools import cache
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from torchrl_ecpo.envs import readable
+
+
+def open_raw_task(name: str, **options: Any) -> gym.Env:
+    """A task of gymnasium, as it is.
+
+    Args:
+        name: its id.
+        options: of ``gymnasium.make``.
+
+    Raises:
+        ModuleNotFoundError: if a package is missing.
+        ValueError: if there is no such task.
+    """
+    try:
+        return gym.make(name, disable_env_checker=True, **options)
+    except (gym.error.DependencyNotInstalled, ModuleNotFoundError) as error:
+        raise missing(f"env.name={name}", error) from error
+    except gym.error.Error as error:
+        raise ValueError(
+            f"env.name={name} is no task of gymnasium: {' '.join(str(error).split())} If another "
+            "module registers it, name that too: env.name=module:Task-v0."
+        ) from error
+
+
+def open_task(name: str, **options: Any) -> gym.Env:
+    """A task of gymnasium, with spaces that a network can read and play; likewise."""
+    env = open_raw_task(name, **options)
+    try:
+        return readable(env)
+    except ValueError as error:
+        raise ValueError(f"env.name: {error}") from error
+
+
+@cache
+def is_plain(name: str) -> bool:
+    """Whether the spaces of a task are plain as it is.
+
+    Raises:
+        ModuleNotFoundError: if a package is missing.
+        ValueError: if it cannot be played, or no two copies of it start alike.
+    """
+    with closing(open_raw_task(name)) as raw, closing(open_task(name)) as copy:
+        first, second = readable(raw).reset(seed=0)[0], copy.reset(seed=0)[0]
+        if not np.array_equal(first, second, equal_nan=True):
+            raise ValueError(
+                f"env.name={name}: two copies of a problem instance differ at their start, though "
+                "they are reset with one seed. It has to draw its start from self.np_random, which "
+                "super().reset(seed=seed) seeds."
+            )
+        return readable(raw) is raw
+
+
+def missing(task: str, error: Exception) -> ModuleNotFoundError:
+    """What to say where a task needs a package."""
+    return ModuleNotFoundError(
+        f"{task} needs what is not installed: {error} For MuJoCo and dm_control: "
+        "pip install '.[mujoco]' in the repository, likewise box2d and minigrid."
+    )
