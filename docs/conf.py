@@ -86,7 +86,10 @@ def signature_of_init(
         return None
     arguments = inspect.signature(found.__init__, bound_method=True)
     text = inspect.stringify_signature(
-        arguments, show_return_annotation=False, unqualified_typehints=True
+        arguments,
+        show_return_annotation=False,
+        unqualified_typehints=True,
+        short_literals=python_display_short_literal_types,
     )
     return text, returns
 

@@ -158,7 +158,7 @@ SET = "!document.querySelector('.math') || document.querySelector('mjx-container
 def test_pages_are_whole_on_a_desk_and_on_a_phone(site, tmp_path, width, scheme):
     """Nothing sticks out, every formula is set, every picture is there; nothing is asked elsewhere.
 
-    Screenshots, to be looked at, are in ``tmp_path``.
+    Screenshots of what is seen first are in ``tmp_path``.
     """
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     with api.sync_playwright() as playwright:
@@ -176,7 +176,7 @@ def test_pages_are_whole_on_a_desk_and_on_a_phone(site, tmp_path, width, scheme)
                 continue
             page.goto(file.as_uri())
             page.wait_for_function(SET)
-            page.screenshot(path=tmp_path / f"{name.replace('/', '_')}.png", full_page=True)
+            page.screenshot(path=tmp_path / f"{name.replace('/', '_')}.png")
             seen[name] = page.evaluate(SEEN)
         browser.close()
     assert seen == dict.fromkeys(seen, WHOLE)

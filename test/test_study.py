@@ -712,7 +712,7 @@ def test_the_report_writes_the_committed_sections(study, monkeypatch, tmp_path):
                 entry, study.results.read_cells(manifest, entry), tmp_path
             )
             assert f"\n\n{section}\n" in page, name
-    assert len(list((tmp_path / "figures/study").iterdir())) == 6
+    assert len(list((tmp_path / "figures/study").iterdir())) == 2
     assert_pictures_are_committed(tmp_path / "figures/study")
 
 

@@ -34,7 +34,7 @@ __all__ = [
 NEUTRAL = "#7a7a7a"
 """The grey of text and axes. Its contrast is the same, 4.3, to white and to a dark page."""
 WIDTH = 7.6  # inches, at most, which is what a page of text has: pictures are not scaled
-STYLE: dict[str, Any] = {
+STYLE: dict[Any, Any] = {
     "axes.edgecolor": NEUTRAL,
     "axes.labelcolor": NEUTRAL,
     "axes.titlesize": "medium",
@@ -164,7 +164,7 @@ def plot_comparison(
     for panel, (title, curves) in zip(axes, panels.items(), strict=True):
         for name, value in (levels or {}).get(title, {}).items():
             entries[name] = panel.axhline(value, color=NEUTRAL, linewidth=1, linestyle=dashes[name])
-        for method in reversed(curves):  # the first is on top
+        for method in reversed([*curves]):  # the first is on top
             entries[method] = draw_curve(
                 panel, *curves[method], color=colours[method], label=symbols(method)
             )
