@@ -151,6 +151,34 @@ def test_an_option_that_is_gone_or_new_makes_no_other_run_unless_it_has_another_
     assert changed({"stop_when.at_least": 25}, {"stop_when": "None"}) == []
 
 
+def test_a_run_whose_options_had_other_names_is_the_same_run(study):
+    changed = study.manifest.changed_entries
+    old = {"evaluation_interval": 50, "env.evaluation_interval": 7, "env.hidden_sizes": "[64]"}
+    old |= {"loss.options.tau": 0.3, "loss.lr.actor_network": 0.1, "loss.lr.log_tau": 0.01}
+    new = {"evaluation.interval": 50, "hidden_sizes": "[64]", "loss.tau": 0.3}
+    new |= {"optim.lr.actor_network": 0.1, "optim.lr.log_tau": 0.01, "optim.lr.value_network": 3e-4}
+    assert changed(old, new) == []
+    assert changed(old, new | {"loss.tau": 0.5}) == ["loss.tau was 0.3, is 0.5"]
+    present = study.manifest.present
+    label = "loss.lr.actor_network 1e-3, loss.options.tau_prime 0.1"
+    assert present(label) == "optim.lr.actor_network 1e-3, loss.tau_prime 0.1"
+    assert present("my.loss.lr.x loss.lrs=1") == "my.loss.lr.x loss.lrs=1"
+
+
+@pytest.mark.slow  # composing takes long
+def test_committed_runs_are_those_of_their_cells_still(study):
+    """A cell of each method, whose configuration is compared with that of its runs."""
+    manifest, compared = study.manifest.read_manifests(), set()
+    for name, own in manifest.studies.items():
+        results = study.results.Results.read(study.results.RESULTS / "study" / name)
+        for cell in manifest.cells(own):
+            runs = study.results.read_cell(cell, results).runs
+            if runs and (name, cell.method) not in compared:
+                compared.add((name, cell.method))
+                assert results.has(cell, next(iter(runs))), cell.name
+    assert len(compared) > 100
+
+
 def test_what_determines_no_number_of_a_run_is_not_its_identity(study):
     goal = {"metric": "return", "at_least": 25, "batches": 20}
     config = {"total_trajectories": 9, "epochs": 2, "seed": 1, "threads": 1}

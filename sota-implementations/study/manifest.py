@@ -48,6 +48,7 @@ IMPLIED = {
     "policy.hidden_size": 128,
     "epochs": 1,
     "max_kl": "None",
+    "loss.width_entropy": 1.0,
     # Of what is not learned, which had none.
     "optim.lr.log_tau": 0.01,
     "optim.lr.log_tau_prime": 0.0003,

@@ -366,20 +366,22 @@ def _comment(file: Path, *, whole: bool = False) -> str:
 
 
 def _words(configs: Path, options: Sequence[str], name: str) -> dict[str, str]:
-    """What stands behind the options, in the files that a configuration is composed of."""
+    """What is said of options in the files that a configuration is composed of."""
     loader: Any = GlobalHydra.instance().config_loader()
     words: dict[str, str] = {}
     for default in loader.compute_defaults_list(name, list(options), RunMode.RUN).defaults:
         file = configs / f"{default.config_path}.yaml"
         if file.is_file():
-            lines = file.read_text().splitlines()
             parent = "" if default.package in ("", "_global_") else f"{default.package}."
-            words |= {
-                f"{parent}{key}": word
-                for key, line in _lines(yaml.compose("\n".join(lines)))
-                if (word := lines[line].partition(" # ")[2])
-            }
+            words |= {f"{parent}{key}": word for key, word in words_of(file).items()}
     return words
+
+
+def words_of(file: Path) -> dict[str, str]:
+    """The comment behind each option of a file, on its line."""
+    lines = file.read_text().splitlines()
+    words = {key: lines[at].partition(" # ")[2] for key, at in _lines(yaml.compose(file.open()))}
+    return {key: word for key, word in words.items() if word}
 
 
 def _lines(node: Any) -> Iterator[tuple[str, int]]:
