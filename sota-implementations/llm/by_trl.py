@@ -23,18 +23,17 @@ from torchrl_ecpo.experiment import Run, check_command_line
 class Logged(TrainerCallback):
     """Passes on what TRL measures of each batch, under the names that llm.py has."""
 
-    names = {"reward": "return", "completions/mean_length": "length", "grad_norm": "grad_norm"}
-
-    def __init__(self, run: Run, config: DictConfig) -> None:
-        self.run, self.batch_size = run, config.num_prompts * config.group_size
-        self.epochs = config.epochs
+    def __init__(self, run: Run, batch_size: int) -> None:
+        self.run, self.batch_size, self.batches = run, batch_size, 0
 
     def on_log(self, args: Any, state: Any, control: Any, logs: Any = None, **_: Any) -> None:
-        """Of the first gradient step on a batch, which TRL logs it with."""
+        """TRL logs a batch with the first gradient step on it; its entropy is that of a token."""
         if "reward" in logs:
-            batches = (state.global_step + self.epochs - 1) // self.epochs
-            values = {ours: float(logs[name]) for name, ours in self.names.items() if name in logs}
-            self.run.log(values, step=batches * self.batch_size - 1)
+            self.batches += 1
+            length = float(logs["completions/mean_length"])
+            values = {"return": float(logs["reward"]), "length": length}
+            values["entropy"] = float(logs["entropy"]) * length
+            self.run.log(values, step=self.batches * self.batch_size - 1)
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
@@ -80,7 +79,7 @@ def main(config: DictConfig) -> None:
             reward_funcs=is_right,
             train_dataset=Dataset.from_dict({"prompt": prompts}),
             processing_class=tokenizer,
-            callbacks=[Logged(run, config)],
+            callbacks=[Logged(run, batch_size)],
             optimizers=(torch.optim.Adam(model.parameters(), lr=config.optim.lr), None),
         )
         trainer.train()

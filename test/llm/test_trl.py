@@ -101,7 +101,7 @@ def test_short_answers_are_learned(make_trainer):
 
 def test_groups_that_are_cut_are_refused(make_trainer):
     trainer = make_trainer(tiny.make_model(), per_device_train_batch_size=3, steps_per_generation=2)
-    with pytest.raises(ValueError, match="Groups of unequal size|at least 2"):
+    with pytest.raises(ValueError, match="Groups of unequal size"):
         trainer.train()
 
 
