@@ -8,7 +8,7 @@ export OMP_NUM_THREADS ?= 1
 export MUJOCO_GL ?= disabled
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo study report test test-slow test-faults lint format types docs clean
+.PHONY: help install demo demo-llm study report test test-slow test-faults lint format types docs clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -34,6 +34,12 @@ demo: install ## compare ECPO, UREX and Dr.GRPO on Reverse, and ECPO, UREX and M
 		'stack=["loss=ecpo,urex,ment seed=1,2,3"]' hydra.run.dir=runs/demo/bandit
 	@$(RUN) -m torchrl_ecpo.experiment.compare runs/demo/reverse --title Reverse
 	@$(RUN) -m torchrl_ecpo.experiment.compare runs/demo/bandit --title "10,000-armed bandit"
+
+demo-llm: install ## teach a small language model Countdown by ECPO and by GRPO, and draw its pass@64
+	$(RUN) sota-implementations/llm/llm.py --multirun task=countdown loss=ecpo,grpo \
+		hydra.sweep.dir=runs/demo/llm
+	@$(RUN) -m torchrl_ecpo.experiment.compare runs/demo/llm --metric pass_at_64 \
+		--title "Countdown" --x-label "completions"
 
 study: install ## make the runs of the study that are not in runs/study; ARGS='--missing', ARGS='--only figure1 --seeds 1-3'
 	$(RUN) sota-implementations/study/run.py $(ARGS)

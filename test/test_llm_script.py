@@ -39,10 +39,10 @@ def modules(monkeypatch):
         sys.modules.pop(name, None)
 
 
-def run_llm(directory, *options):
+def run_llm(directory, *options, script=SCRIPT):
     flags = [option for option in options if option.startswith("--")]
     options = [option for option in options if option not in flags]
-    process = run_script(directory, SCRIPT, *flags, *TINY, *options)
+    process = run_script(directory, script, *flags, *TINY, *options)
     assert process.returncode == 0, process.stderr
     return process.stdout
 
@@ -108,6 +108,25 @@ def test_every_loss_trains(tmp_path):
         listed = (tmp_path / loss / "completions.txt").read_text()
         assert re.search(r"^ +\d+ (right|wrong)  ", listed, re.MULTILINE)
     assert len(set(map(tuple, start.values()))) == 1  # one model, before the first update
+
+
+@pytest.mark.slow  # three times the import of transformers
+def test_trl_trains_the_model_of_another_run(tmp_path):
+    """From where a run of no completions ended: the same answers at the start."""
+    pytest.importorskip("trl")
+    start, trained = tmp_path / "start", tmp_path / "trained"
+    start.mkdir(), trained.mkdir()
+    run_llm(start, "task=sums", "total_completions=0", f"hydra.run.dir={start}")
+    options = ("task=sums", "loss=trl", f"model.path={start}/model", "supervised.steps=0")
+    script = SCRIPT.with_name("by_trl.py")
+    run_llm(trained, *options, f"hydra.run.dir={trained}", script=script)
+    first, metrics = read_metrics(start), read_metrics(trained)
+    assert metrics["step"] == [0, 5, 11, 12]
+    for name in ("pass_at_1", "pass_at_64", "distinct_right"):
+        assert metrics[name][0] == first[name][0]
+        assert 0 <= metrics[name][3]
+    assert 0 < metrics["length"][1] <= 4
+    assert metrics["entropy"][1] > 0
 
 
 @pytest.mark.slow  # three times the import of transformers
