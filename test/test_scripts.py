@@ -16,6 +16,7 @@ import gymnasium as gym
 import pytest
 import torch
 from omegaconf import OmegaConf
+from PIL import Image
 from processes import run_script
 from tensordict import TensorDict
 
@@ -24,6 +25,7 @@ from torchrl_ecpo.experiment._tasks import is_plain, open_task
 
 ROOT = Path(__file__).parents[1]
 ECPO = ROOT / "sota-implementations/ecpo/ecpo.py"
+MODULES = ("tasks", "utils", "play", "stacked")
 TINY = ("env.num_actions=30", "total_trajectories=60", "group_size=10")
 
 
@@ -45,7 +47,7 @@ def script_modules(monkeypatch):
     """Imports what is beside the script, as if it were started from there."""
     monkeypatch.syspath_prepend(str(ECPO.parent))
     yield importlib.import_module
-    for name in ("tasks", "utils"):
+    for name in [name for name in sys.modules if name.split(".")[0] in MODULES]:
         sys.modules.pop(name, None)
 
 
@@ -264,6 +266,22 @@ def test_every_kind_of_task_runs(tmp_path, options):
     metrics = read_metrics(tmp_path)
     assert metrics["step"][-1] >= 40
     assert all(math.isfinite(loss) for loss in metrics["loss_actor"])
+
+
+def test_play_shows_runs_that_are_not_algorithmic(sweep, script_modules, tmp_path, capsys):
+    play = script_modules("play").main
+    play([str(sweep / "ecpo")])  # the bandit: what its most probable action earns
+    assert re.fullmatch(r"return 0\.\d+\n", capsys.readouterr().out)
+    options = ("env=gym", "env.max_steps=20", "num_groups=1", "group_size=4")
+    run_ecpo(tmp_path, *options, "total_trajectories=8", f"hydra.run.dir={tmp_path}")
+    play([str(tmp_path), "--episodes", "1"])
+    first, mean, drawn = capsys.readouterr().out.splitlines()
+    steps = int(first.split()[2])  # a reward of 1 for each
+    assert first == f"return {steps}, {steps} steps"
+    assert mean == f"mean return {steps}"
+    assert drawn == f"the first one is drawn in {tmp_path / 'episode.gif'}"
+    with Image.open(tmp_path / "episode.gif") as video:
+        assert 1 < video.n_frames <= steps
 
 
 def test_the_toy_tasks_of_gymnasium_train(tmp_path):

@@ -228,9 +228,9 @@ def make_optimizer(learning_rates: DictConfig, loss_module: LossModule) -> torch
     for name, parameter in loss_module.named_parameters():
         owner = name.split(".")[0].removesuffix("_params")
         networks.setdefault(owner, []).append(parameter)
-    if missing := networks.keys() - set(learning_rates):
+    if without := networks.keys() - set(learning_rates):
         raise ValueError(
-            f"optim.lr must have a learning rate for each of {sorted(missing)}, got "
+            f"optim.lr must have a learning rate for each of {sorted(without)}, got "
             f"{sorted(map(str, learning_rates))}."
         )
     groups: dict[float, list[Tensor]] = {}  # by rate: fewer groups are less overhead

@@ -94,7 +94,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             make = partial(make_single, config)
             show(make, task.actor, options.episodes, directory, config.env.name)
         else:  # one problem instance, in which greedy episodes are all alike
-            print(f"return {greedy(task.env, task.actor)[0, 0]['next', 'reward'].sum().item():g}")
+            played: Any = greedy(task.env, task.actor)[0, 0]
+            print(f"return {played['next', 'reward'].sum().item():g}")
     except (CheckpointError, FileNotFoundError, ValueError) as error:
         parser.error(str(error))
 

@@ -384,32 +384,38 @@ def leaving_nothing(main: Callable[[DictConfig], None]) -> Callable[[DictConfig]
 
     @wraps(main)
     def run(config: DictConfig) -> None:
+        before = _present()
         try:
             main(config)
         except (ValueError, LookupError, OSError, ImportError, CheckpointError) as error:
+            has_begun = _clear(_present() - before)
             is_alone = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.RUN
-            if _clear() and is_alone and "HYDRA_FULL_ERROR" not in os.environ:
-                message = error.args[0] if isinstance(error, KeyError) else error
-                raise SystemExit(f"{Path(sys.argv[0]).name}: {message}") from None
-            raise
+            if has_begun or not is_alone or "HYDRA_FULL_ERROR" in os.environ:
+                raise
+            message = error.args[0] if isinstance(error, KeyError) else error
+            raise SystemExit(f"{Path(sys.argv[0]).name}: {message}") from None
 
     return run
 
 
-def _clear() -> bool:
-    """Remove the directory of a run that has only begun; whether it was one."""
+def _present() -> set[Path]:
+    """What is in the directory of a run, if it has one."""
     here = Path.cwd()
-    files = [path for path in here.rglob("*") if path.is_file()]
-    is_begun = all(path.name in BEGUN for path in files)
-    if is_begun:
-        for path in files:
-            path.unlink()
-        below = sorted(here.rglob("*"), reverse=True)
-        for folder in (*below, here, *here.parents):
-            if folder == Path(to_absolute_path(".")) or any(folder.iterdir()):
+    return set() if here == Path(to_absolute_path(".")) else {here, *here.rglob("*")}
+
+
+def _clear(made: set[Path]) -> bool:
+    """Remove what a run has made, with its directory, unless there is more than how it begins."""
+    has_begun = any(path.is_file() and path.name not in BEGUN for path in made)
+    if not has_begun:
+        start, here = Path(to_absolute_path(".")), Path.cwd()
+        for path in sorted(made, reverse=True):
+            path.unlink() if path.is_file() else path.rmdir()
+        for folder in (here, *here.parents):
+            if folder == start or any(folder.iterdir()):
                 break
             folder.rmdir()
-    return is_begun
+    return has_begun
 
 
 def _versions() -> dict[str, str]:
