@@ -379,8 +379,9 @@ def _words(configs: Path, options: Sequence[str], name: str) -> dict[str, str]:
 
 def words_of(file: Path) -> dict[str, str]:
     """The comment behind each option of a file, on its line."""
-    lines = file.read_text().splitlines()
-    words = {key: lines[at].partition(" # ")[2] for key, at in _lines(yaml.compose(file.open()))}
+    text = file.read_text()
+    lines = text.splitlines()
+    words = {key: lines[at].partition(" # ")[2] for key, at in _lines(yaml.compose(text))}
     return {key: word for key, word in words.items() if word}
 
 
