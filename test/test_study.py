@@ -28,6 +28,8 @@ from torchrl_ecpo.experiment.compare import final
 from torchrl_ecpo.experiment.figures import METHOD_COLOURS, colours_of
 
 ROOT = Path(__file__).parents[1]
+# Searches beyond the edge of a grid, where some methods had their best at two edges.
+UNEQUAL = ("search_bandit_slower", "search_bandit_rivals_wider", "search_wider_reverse")
 STUDY, COMMITTED = ROOT / "sota-implementations/study", ROOT / "docs"
 MODULES = sorted(path.stem for path in STUDY.glob("*.py"))
 
@@ -123,12 +125,12 @@ def test_the_study_is_what_was_planned(study):
     names = ("first_bandit", "first_tasks", "figure2")
     reported = {seed for name in names for seed in manifest.studies[name].seeds}
     searches = {n: entry for n, entry in manifest.studies.items() if n.startswith("search")}
-    assert len(searches) == 15
+    assert len(searches) == 17
     for name, search in searches.items():
         assert not reported & set(search.seeds), "searched on the reported seeds"
         cells = [(cell.task.name, cell.method) for cell in manifest.cells(search)]
         is_equal = len({cells.count(cell) for cell in cells}) == 1
-        assert is_equal or name in ("search_bandit_slower", "search_wider_reverse"), name
+        assert is_equal or name in UNEQUAL, name
     methods: dict[tuple[str, str], int] = {}
     for cell in (cell for search in searches.values() for cell in manifest.cells(search)):
         if cell.task.script.startswith("ecpo"):
