@@ -141,7 +141,8 @@ def test_a_resumed_run_equals_one_that_was_never_stopped(tmp_path, start, capfd,
     with pytest.raises(SystemExit) as stop:
         start(parts, *run, stop_at=first)
     assert stop.value.code == 128 + signal.SIGTERM
-    assert f"Resume with: python {sys.argv[0]} resume={parts}" in capfd.readouterr().out
+    command = shlex.join(["python", *sys.argv, f"resume={parts}"])
+    assert f"Resume with: {command}" in capfd.readouterr().out
     with pytest.raises(Killed):
         start(parts, *run, f"resume={parts}", save_at=1, kill_at=second - first + 1)
     assert len(record(parts)) < len(record(whole))

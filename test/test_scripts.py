@@ -20,7 +20,7 @@ from PIL import Image
 from processes import run_script
 from tensordict import TensorDict
 
-from torchrl_ecpo.experiment import compare, compose_options, read_metrics
+from torchrl_ecpo.experiment import _tasks, compare, compose_options, read_metrics
 from torchrl_ecpo.experiment._tasks import is_plain, open_task
 
 ROOT = Path(__file__).parents[1]
@@ -80,7 +80,8 @@ def test_every_loss_trains_on_the_bandit(sweep, loss):
     assert OmegaConf.load(run / "config.yaml").loss.name == loss
     assert (run / "curve.png").exists()
     command = (run / "command.txt").read_text()
-    assert command.startswith(f"python {ECPO} loss={loss} form=paper seed=5 project_steps=3 ")
+    options = [*TINY, f"loss={loss}", "form=paper", "seed=5", "project_steps=3"]
+    assert command == f"python {ECPO} {' '.join(options)}\n"
     commit = json.loads((run / "versions.json").read_text())["commit"]
     assert re.fullmatch(r"[0-9a-f]{40}(-dirty)?|unknown", commit)
     assert not list(run.glob("*.log"))
@@ -403,10 +404,12 @@ def test_a_task_whose_package_is_not_there_says_so():
 
 
 def test_a_task_is_opened_no_more_often_than_it_is_played(script_modules, monkeypatch):
-    """Twice at the door, ten times for the evaluation, and the vector's own copy."""
+    """Twice at the door, and for the ten copies of the evaluation; the vector has its own."""
     is_plain.cache_clear()
-    make, opened = gym.make, []
-    monkeypatch.setattr(gym, "make", lambda name, **options: opened.append(name) or make(name))
+    opened, open_raw_task = [], _tasks.open_raw_task
+    monkeypatch.setattr(
+        _tasks, "open_raw_task", lambda name: opened.append(name) or open_raw_task(name)
+    )
     config = compose_options(ECPO.parent, ["env=gym", "env.name=MountainCar-v0"])
     script_modules("utils").check_config(config)
     assert len(opened) == 2
