@@ -1,0 +1,91 @@
+"""The table and the figure of the comparison, from committed results: ``python comparison.py``."""
+
+from __future__ import annotations
+
+import csv
+from collections import defaultdict
+from pathlib import Path
+from statistics import fmean, stdev
+
+from matplotlib.figure import Figure
+
+from torchrl_ecpo.experiment.figures import save_figure
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "sota-implementations/results/study"
+METRICS = ("pass_at_1", "pass_at_8", "pass_at_64", "distinct_right", "entropy", "length")
+Key = tuple[str, str, str]
+
+
+def read_runs(study: str) -> dict[Key, list[list[dict[str, float]]]]:
+    """By task, method and setting, the rows of each run: what was measured at each step."""
+    seeds: dict[tuple[str, ...], list[dict[str, float]]] = defaultdict(list)
+    with (RESULTS / study / "curves.csv").open(newline="") as file:
+        for row in csv.DictReader(file):
+            key = (row["task"], row["method"], row["setting"], row["seed"])
+            measured = {name: float(row[name]) for name in ("step", *METRICS) if row[name]}
+            seeds[key].append(measured)
+    runs: dict[Key, list[list[dict[str, float]]]] = defaultdict(list)
+    for (task, method, setting, _), rows in seeds.items():
+        runs[task, method, setting].append(rows)
+    return runs
+
+
+def at_the_end(rows: list[dict[str, float]]) -> dict[str, float]:
+    """The mean of each metric over the last tenth of a run."""
+    late = [row for row in rows if row["step"] > 0.9 * rows[-1]["step"]]
+    return {name: fmean(row[name] for row in late if name in row) for name in METRICS}
+
+
+def at_the_start(rows: list[dict[str, float]]) -> dict[str, float]:
+    """The first value of each metric."""
+    return {name: next(row[name] for row in rows if name in row) for name in METRICS}
+
+
+def cells(ends: list[dict[str, float]]) -> str:
+    """Means over runs with standard errors, as the columns of a table."""
+    texts = []
+    for name in METRICS:
+        values, digits = [end[name] for end in ends], 3 if name.startswith("pass") else 2
+        error = f" ± {stdev(values) / len(values) ** 0.5:.{digits}f}" if len(values) > 1 else ""
+        texts.append(f"{fmean(values):.{digits}f}{error}")
+    return " | ".join(texts)
+
+
+def table(study: str) -> list[str]:
+    """A row for each method and setting: at the end of its runs."""
+    rows = []
+    for (_, method, setting), seeds in read_runs(study).items():
+        ends = [at_the_end(rows) for rows in seeds]
+        rows.append(f"| {method} | {setting or len(ends)} | {cells(ends)} |")
+    return rows
+
+
+def draw(path: Path) -> None:
+    """pass@64 over pass@1 at the end of each setting, by method and learning rate."""
+    figure = Figure(figsize=(5.5, 4), layout="constrained")
+    axes, runs = figure.subplots(), read_runs("llm_search")
+    methods = list(dict.fromkeys(method for _, method, _ in runs))
+    for (_, method, setting), (rows,) in runs.items():
+        end, rate = at_the_end(rows), setting.split("optim.lr ")[1]
+        colour = f"C{methods.index(method)}"
+        marker = "o" if rate == "0.00025" else "^"
+        axes.plot(end["pass_at_1"], end["pass_at_64"], marker, color=colour)
+    start = at_the_start(rows)
+    axes.plot(start["pass_at_1"], start["pass_at_64"], "k*", markersize=10)
+    for number, method in enumerate(methods):
+        axes.plot([], [], "s", color=f"C{number}", label=method)
+    for marker, label in {"ko": "rate 0.00025", "k^": "rate 0.0005", "k*": "start"}.items():
+        axes.plot([], [], marker, label=label)
+    axes.set(xlabel="pass@1", ylabel="pass@64", title="Countdown, 3,840 completions, one seed")
+    axes.legend(ncols=2)
+    save_figure(figure, path)
+
+
+if __name__ == "__main__":
+    (rows, *_) = next(iter(read_runs("llm_search").values()))
+    print(f"| at the start | | {cells([at_the_start(rows)])} |")
+    for study in ("llm_search", "llm_comparison", "llm_by_trl"):
+        if (RESULTS / study).exists():
+            print(*table(study), sep="\n")
+    draw(ROOT / "docs/figures/llm_search.svg")
