@@ -14,7 +14,7 @@ from datasets import Dataset
 from omegaconf import DictConfig
 from tasks import TASKS
 from transformers import TrainerCallback
-from trl import GRPOConfig, GRPOTrainer
+from trl import GRPOConfig, GRPOTrainer  # pyright: ignore[reportPrivateImportUsage]
 from utils import Policy, check_model, make_model
 
 from torchrl_ecpo.experiment import Run, check_command_line
@@ -55,9 +55,9 @@ def main(config: DictConfig) -> None:
         shown=("pass_at_1", "pass_at_8", "pass_at_64", "distinct_right"),
     )
 
-    def is_right(prompts: list[str], completion_ids: list[list[int]], **_: Any) -> list[float]:
-        answers = policy.decode(completion_ids)
-        return [float(task.is_right(*pair)) for pair in zip(prompts, answers, strict=True)]
+    def is_right(prompts: list[str], completion_ids: list[list[int]], **_: Any) -> Any:
+        pairs = zip(prompts, policy.decode(completion_ids), strict=True)
+        return [float(task.is_right(*pair)) for pair in pairs]
 
     with run:
         policy.supervise(config.supervised, Random(f"supervised {config.seed}"))

@@ -53,17 +53,18 @@ def cells(ends: list[dict[str, float]]) -> str:
 
 
 def table(study: str) -> list[str]:
-    """A row for each method and setting: at the end of its runs."""
+    """A row for each task, method and setting: at the end of its runs."""
     rows = []
-    for (_, method, setting), seeds in read_runs(study).items():
+    for (task, method, setting), seeds in read_runs(study).items():
         ends = [at_the_end(rows) for rows in seeds]
-        rows.append(f"| {method} | {setting or len(ends)} | {cells(ends)} |")
+        what = setting or f"{task.removesuffix('_by_trl')} | {len(ends)}"
+        rows.append(f"| {method} | {what} | {cells(ends)} |")
     return rows
 
 
 def draw(path: Path) -> None:
     """pass@64 over pass@1 at the end of each setting, by method and learning rate."""
-    figure = Figure(figsize=(5.5, 4), layout="constrained")
+    figure = Figure(figsize=(6.5, 3.8), layout="constrained")
     axes, runs = figure.subplots(), read_runs("llm_search")
     methods = list(dict.fromkeys(method for _, method, _ in runs))
     for (_, method, setting), (rows,) in runs.items():
@@ -78,7 +79,7 @@ def draw(path: Path) -> None:
     for marker, label in {"ko": "rate 0.00025", "k^": "rate 0.0005", "k*": "start"}.items():
         axes.plot([], [], marker, label=label)
     axes.set(xlabel="pass@1", ylabel="pass@64", title="Countdown, 3,840 completions, one seed")
-    axes.legend(ncols=2)
+    figure.legend(loc="outside right upper")
     save_figure(figure, path)
 
 

@@ -68,7 +68,8 @@ def main(config: DictConfig) -> None:
                 metrics |= policy.evaluate(config.evaluation)
             run.log(metrics, step=progress.completions)
             checkpoints.boundary()
-        model.save_pretrained("model"), tokenizer.save_pretrained("model")  # for model.path
+        for part in (model, tokenizer):
+            part.save_pretrained("model")  # for model.path
 
 
 if __name__ == "__main__":

@@ -109,7 +109,7 @@ class Policy:
             self.model(tokens, attention_mask=mask.long(), labels=labels).loss.backward()
             optimizer.step()
 
-    def decode(self, response: Tensor) -> list[str]:
+    def decode(self, response: Tensor | list[list[int]]) -> list[str]:
         """Tokens as text, without end and padding."""
         texts = self.tokenizer.batch_decode(response, skip_special_tokens=True)
         return ["".join(text.split()) for text in texts]
