@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import torch
+from gymnasium.wrappers import FrameStackObservation
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import (
@@ -34,6 +35,7 @@ from torchrl.envs import (
 )
 from torchrl.modules import (
     MLP,
+    LSTMModule,
     ProbabilisticActor,
     TanhNormal,
     ValueOperator,
@@ -242,19 +244,29 @@ def make_raw_copy(name: str) -> gym.Env:
         ) from error
 
 
-def make_copy(name: str) -> gym.Env:
-    """A task of gymnasium, with spaces that the policy can read and play."""
+def make_copy(name: str, window: int = 1) -> gym.Env:
+    """A task of gymnasium, with spaces that the policy can read and play.
+
+    With a `window` it shows the last observations; those before the first are 0.
+    """
     try:
-        return readable(make_raw_copy(name))
+        env = readable(make_raw_copy(name))
+        if window == 1:
+            return env
+        return readable(FrameStackObservation(env, window, padding_type="zero"))
     except ValueError as error:
         raise ValueError(f"env.name: {error}") from error
 
 
 def make_gym(config: DictConfig) -> Task:
-    """A gymnasium task of any readable spaces, with a feed-forward policy."""
+    """A gymnasium task of any readable spaces; its policy is feed-forward but for policy=."""
+    memory = config.get("policy")
+    window = 1 if memory is None else memory.window or 1
+    units = memory.hidden_size if memory is not None and memory.window is None else 0
+    make_own_copy = partial(make_copy, config.env.name, window)
 
     def make_torchrl_copy() -> EnvBase:
-        return GymWrapper(make_copy(config.env.name), categorical_action_encoding=True)
+        return GymWrapper(make_own_copy(), categorical_action_encoding=True)
 
     def make_evaluation_copy() -> EnvBase:
         return TransformedEnv(make_torchrl_copy(), EpisodeReplay())
@@ -265,7 +277,8 @@ def make_gym(config: DictConfig) -> Task:
 
     # By its id a task is played by its own vector entry point, if that can be.
     raw = make_raw_copy(config.env.name)
-    source: Any = config.env.name if readable(raw) is raw else partial(make_copy, config.env.name)
+    is_plain = readable(raw) is raw and window == 1
+    source: Any = config.env.name if is_plain else make_own_copy
 
     def make_env(num_groups: int) -> EnvBase:
         sizes = {"num_groups": num_groups, "group_size": config.group_size}
@@ -274,7 +287,10 @@ def make_gym(config: DictConfig) -> Task:
     copies = SerialEnv(10, make_evaluation_copy)
     env, evaluation_env = make_env(config.num_groups), limited(copies)
     evaluation_env.set_seed(config.seed + 1_000_000)
-    actor = make_feed_forward_policy(env, config.env.hidden_sizes)
+    actor = make_gym_policy(env, config.env.hidden_sizes, units)
+    if units:
+        transforms = get_env_transforms_from_module(actor)
+        evaluation_env = TransformedEnv(evaluation_env, transforms, auto_unwrap=False)
 
     def measure(groups: TensorDictBase) -> Metrics:
         length = groups["collector", "mask"].sum(-1).float().mean()
@@ -371,9 +387,14 @@ class Alone(nn.Module):
         return (outputs,)
 
 
-def feed_forward(env: EnvBase, out_features: int, hidden_sizes: Sequence[int]) -> nn.Module:
-    """A multi-layer perceptron on the observation, behind convolutions where it is an image."""
-    shape = env.observation_spec["observation"].shape[env.ndim :]
+def feed_forward(
+    env: EnvBase, out_features: int, hidden_sizes: Sequence[int], in_features: int = 0
+) -> nn.Module:
+    """A multi-layer perceptron on the observation, behind convolutions where it is an image.
+
+    Or, with `in_features`, on so many numbers that stand for it.
+    """
+    shape = (in_features,) if in_features else env.observation_spec["observation"].shape[env.ndim :]
     encoder = PixelEncoder(shape) if len(shape) == 3 else None
     network = MLP(
         in_features=shape[-1] if encoder is None else encoder.size,
@@ -384,14 +405,18 @@ def feed_forward(env: EnvBase, out_features: int, hidden_sizes: Sequence[int]) -
     return network if encoder is None else nn.Sequential(encoder, network)
 
 
-def make_feed_forward_policy(
-    env: EnvBase, hidden_sizes: Sequence[int]
+def make_gym_policy(
+    env: EnvBase, hidden_sizes: Sequence[int], units: int = 0
 ) -> ProbabilisticTensorDictSequential:
-    """A network with a head for the actions: categorical or tanh-Gaussian, or one of each."""
+    """A network with a head for the actions: categorical or tanh-Gaussian, or one of each.
+
+    With `units`, an LSTM reads the observations, and the network, its state.
+    """
     one = (0,) * env.ndim
     specs: Any = env.full_action_spec.items(True, True)
     heads: dict[Any, Head] = {key: Head.of(spec, one) for key, spec in specs}
-    network = feed_forward(env, sum(head.size for head in heads.values()), hidden_sizes)
+    size = sum(head.size for head in heads.values())
+    network = feed_forward(env, size, hidden_sizes, units)
     names: list[Any]
     if list(heads) == ["action"]:
         head = heads["action"]
@@ -405,8 +430,13 @@ def make_feed_forward_policy(
             "extra_kwargs": {key: head.options for key, head in heads.items()},
         }
 
+    core: list[Any] = [TensorDictModule(network, ["observation"], ["parameters"])]
+    if units:
+        size = env.observation_spec["observation"].shape[-1]
+        lstm = LSTMModule(size, units, in_key="observation", out_key="embed")
+        core = [lstm, TensorDictModule(network, ["embed"], ["parameters"])]
     parts: list[Any] = [
-        TensorDictModule(network, ["observation"], ["parameters"]),
+        *core,
         TensorDictModule(Split(list(heads.values())), ["parameters"], names),
     ]
     return ProbabilisticActor(
