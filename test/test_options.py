@@ -244,7 +244,11 @@ def test_hydra_s_own_flags_are_its_own(monkeypatch, options):
         ("env=copy policy=gru", "Could not find 'policy/gru' Available options in 'policy': lstm"),
         ("form=book", "Could not find 'form/book' Available options in 'form': paper recipe"),
         ("policy=lstm", "ecpo.py: Could not override 'policy'. No match in the defaults list.\n"),
-        ("+policy=lstm", "ecpo.py: policy= is for the algorithmic tasks, got env.kind='bandit'"),
+        ("+policy=lstm", "ecpo.py: policy= is for the algorithmic tasks and env=popgym, got"),
+        (
+            "env=popgym policy=tables",
+            "ecpo.py: policy.tables=true is for the algorithmic tasks",
+        ),
         ("ecac --multirun gamma=0,2", "ecac.py: gamma must be a number >= 0 and <= 1, got 2."),
         ("env=algorithmic", "Could not find 'env/algorithmic' Available options in 'env': bandit"),
         ("ecac env=gym", "ecac.py: env.name must be given.\n"),

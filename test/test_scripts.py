@@ -19,6 +19,8 @@ from omegaconf import OmegaConf
 from PIL import Image
 from processes import run_script
 from tensordict import TensorDict
+from torchrl.envs import GymWrapper
+from torchrl.modules import set_recurrent_mode
 
 from torchrl_ecpo.experiment import _tasks, compare, compose_options, read_metrics
 from torchrl_ecpo.experiment._tasks import is_plain, open_task
@@ -150,6 +152,46 @@ def test_tasks_of_exploration_say_how_many_episodes_are_solved(tmp_path):
         assert len(metrics["pass_at_1"]) == 2
         assert all(0 <= share <= 1 for share in metrics["pass_at_1"] + metrics["pass_at_k"])
         assert metrics["pass_at_1"][0] <= metrics["pass_at_k"][0]
+
+
+def test_a_task_of_popgym_is_played_with_and_without_memory(tmp_path):
+    run_ecpo(
+        tmp_path,
+        "--multirun",
+        "env=popgym",
+        "policy=lstm,window,memoryless",
+        "total_trajectories=20",
+        "num_groups=5",
+        "group_size=2",
+        "env.max_steps=6",
+        "evaluation_interval=1",
+        f"hydra.sweep.dir={tmp_path}",
+        "hydra.sweep.subdir=${policy.name}",
+    )
+    for name in ("lstm", "window", "memoryless"):
+        metrics = read_metrics(tmp_path / name)
+        assert len(metrics["greedy_return"]) == 2
+        assert all(-1 <= value <= 1 for value in metrics["return"] + metrics["greedy_return"])
+
+
+def test_a_window_shows_the_last_observations(script_modules):
+    env, one = (script_modules("tasks").make_copy("CartPole-v1", n) for n in (3, 1))
+    seen = [one.reset(seed=1)[0], *(one.step(0)[0] for _ in range(2))]
+    assert env.reset(seed=1)[0].tolist() == [0.0] * 8 + seen[0].tolist()
+    env.step(0)
+    assert env.step(0)[0].reshape(3, 4).tolist() == [row.tolist() for row in seen]
+
+
+def test_an_lstm_tells_an_observation_by_what_came_before(script_modules):
+    tasks = script_modules("tasks")
+    env = GymWrapper(tasks.make_copy("CartPole-v1"), categorical_action_encoding=True)
+    actor = tasks.make_gym_policy(env, [8], units=4)
+    steps = TensorDict(observation=torch.zeros(2, 3, 4), batch_size=[2, 3])
+    steps["observation"][1, 0] = 1.0
+    steps["is_init"] = (torch.arange(3) == 0).expand(2, 3).unsqueeze(-1)
+    with set_recurrent_mode(True):
+        logits = actor.get_dist(steps).logits
+    assert (logits[0] != logits[1]).all()
 
 
 def test_episodes_and_groups_that_earn_as_much_are_counted(script_modules):

@@ -241,6 +241,7 @@ def test_a_choice_of_studies_tasks_methods_and_seeds(study, tmp_path, counter):
         ({"rank_by": "best"}, "study s: rank_by must be one of .*'final'.*, got 'best'"),
         ({"kind": "heat_map"}, "study s: a heat map needs a grid of two axes"),
         ({"methods": {"A": ["x=1"]}}, "method A must be options of the script, or a mapping"),
+        ({"methods": {"A": {"options": "", "script": "no.py"}}}, "study s: there is no script no"),
         ({"scale_by": "Z"}, r"study s: scale_by: unknown \['Z'\]"),
         ({"steps": 0}, "study s: steps must be an integer of at least 1, got 0"),
         ({"also": "entropy"}, "study s: also must be a list, got 'entropy'"),

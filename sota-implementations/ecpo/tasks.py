@@ -33,6 +33,7 @@ from torchrl.envs import (
 )
 from torchrl.modules import (
     MLP,
+    LSTMModule,
     ProbabilisticActor,
     TanhNormal,
     ValueOperator,
@@ -229,15 +230,18 @@ class Evaluation(nn.Module):
 
 
 def make_gym(config: DictConfig) -> Task:
-    """A gymnasium task of any readable spaces, with a feed-forward policy."""
-    name, limited = config.env.name, partial(_limited, config)
+    """A gymnasium task of any readable spaces; its policy is feed-forward but for policy=."""
+    name, limited, memory = config.env.name, partial(_limited, config), config.get("policy")
+    window = _window(memory)
+    units = memory.hidden_size if memory is not None and memory.window is None else 0
 
     def make_evaluation_copy() -> EnvBase:
-        copy = GymWrapper(open_task(name), categorical_action_encoding=True)
+        copy = GymWrapper(open_task(name, window), categorical_action_encoding=True)
         return TransformedEnv(copy, EpisodeReplay())
 
     # By its id a task is played by its own vector entry point, if that can be.
-    source: Any = name if is_plain(name) else partial(open_task, name)
+    is_as_it_is = window == 1 and is_plain(name)
+    source: Any = name if is_as_it_is else partial(open_task, name, window)
 
     def make_env(num_groups: int) -> EnvBase:
         sizes = {"num_groups": num_groups, "group_size": config.group_size}
@@ -246,7 +250,10 @@ def make_gym(config: DictConfig) -> Task:
     copies = SerialEnv(10, make_evaluation_copy)
     env, evaluation_env = make_env(config.num_groups), limited(copies)
     evaluation_env.set_seed(config.seed + 1_000_000)
-    actor = make_feed_forward_policy(env, config.hidden_sizes)
+    actor = make_gym_policy(env, config.hidden_sizes, units)
+    if units:
+        transforms = get_env_transforms_from_module(actor)
+        evaluation_env = TransformedEnv(evaluation_env, transforms, auto_unwrap=False)
 
     def measure(groups: TensorDictBase) -> Metrics:
         length = groups["collector", "mask"].sum(-1).float().mean()
@@ -273,9 +280,14 @@ def make_gym(config: DictConfig) -> Task:
 def make_single(config: DictConfig, *, from_pixels: bool = False, **options: Any) -> EnvBase:
     """A gymnasium task of no batch size, to look at."""
     drawn: dict[str, Any] = {"render_mode": "rgb_array"} if from_pixels else {}
-    env = open_task(config.env.name, **drawn)
+    env = open_task(config.env.name, _window(config.get("policy")), **drawn)
     options |= {"from_pixels": from_pixels, "categorical_action_encoding": True}
     return _limited(config, GymWrapper(env, **options))
+
+
+def _window(memory: DictConfig | None) -> int:
+    """How many observations a policy is shown at once."""
+    return 1 if memory is None else memory.window or 1
 
 
 def _limited(config: DictConfig, env: EnvBase) -> EnvBase:
@@ -356,9 +368,14 @@ class Alone(nn.Module):
         return (outputs,)
 
 
-def feed_forward(env: EnvBase, out_features: int, hidden_sizes: Sequence[int]) -> nn.Module:
-    """A multi-layer perceptron on the observation, behind convolutions where it is an image."""
-    shape = env.observation_spec["observation"].shape[env.ndim :]
+def feed_forward(
+    env: EnvBase, out_features: int, hidden_sizes: Sequence[int], in_features: int = 0
+) -> nn.Module:
+    """A multi-layer perceptron on the observation, behind convolutions where it is an image.
+
+    Or, with `in_features`, on so many numbers that stand for it.
+    """
+    shape = (in_features,) if in_features else env.observation_spec["observation"].shape[env.ndim :]
     encoder = PixelEncoder(shape) if len(shape) == 3 else None
     network = MLP(
         in_features=shape[-1] if encoder is None else encoder.size,
@@ -369,14 +386,18 @@ def feed_forward(env: EnvBase, out_features: int, hidden_sizes: Sequence[int]) -
     return network if encoder is None else nn.Sequential(encoder, network)
 
 
-def make_feed_forward_policy(
-    env: EnvBase, hidden_sizes: Sequence[int]
+def make_gym_policy(
+    env: EnvBase, hidden_sizes: Sequence[int], units: int = 0
 ) -> ProbabilisticTensorDictSequential:
-    """A network with a head for the actions: categorical or tanh-Gaussian, or one of each."""
+    """A network with a head for the actions: categorical or tanh-Gaussian, or one of each.
+
+    With `units`, an LSTM reads the observations, and the network, its state.
+    """
     one = (0,) * env.ndim
     specs: Any = env.full_action_spec.items(True, True)
     heads: dict[Any, Head] = {key: Head.of(spec, one) for key, spec in specs}
-    network = feed_forward(env, sum(head.size for head in heads.values()), hidden_sizes)
+    size = sum(head.size for head in heads.values())
+    network = feed_forward(env, size, hidden_sizes, units)
     names: list[Any]
     if list(heads) == ["action"]:
         head = heads["action"]
@@ -390,8 +411,13 @@ def make_feed_forward_policy(
             "extra_kwargs": {key: head.options for key, head in heads.items()},
         }
 
+    core: list[Any] = [TensorDictModule(network, ["observation"], ["parameters"])]
+    if units:
+        size = env.observation_spec["observation"].shape[-1]
+        lstm = LSTMModule(size, units, in_key="observation", out_key="embed")
+        core = [lstm, TensorDictModule(network, ["embed"], ["parameters"])]
     parts: list[Any] = [
-        TensorDictModule(network, ["observation"], ["parameters"]),
+        *core,
         TensorDictModule(Split(list(heads.values())), ["parameters"], names),
     ]
     return ProbabilisticActor(

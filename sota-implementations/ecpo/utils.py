@@ -62,10 +62,15 @@ def check_config(config: DictConfig) -> None:
             f"{config.env.kind!r}, whose policy computes each distinct history once: how much that "
             "is differs from batch to batch. Leave out compile."
         )
-    if "policy" in config and config.env.kind != "algorithmic":
+    if "policy" in config and config.env.kind not in ("algorithmic", "gym"):
         raise ValueError(
-            f"policy= is for the algorithmic tasks, got env.kind={config.env.kind!r}, which has a "
-            "policy of its own. Leave out policy."
+            "policy= is for the algorithmic tasks and env=popgym, got "
+            f"env.kind={config.env.kind!r}, which has a policy of its own. Leave out policy."
+        )
+    if config.env.kind == "gym" and "policy" in config and config.policy.tables:
+        raise ValueError(
+            "policy.tables=true is for the algorithmic tasks, got env.kind='gym'. Choose "
+            "policy=window."
         )
 
 

@@ -25,7 +25,7 @@ SCRIPTS = HERE.parent
 MANIFESTS = [HERE / "study.yaml", HERE / "search.yaml"]
 KINDS = ("curves", "heat_map", "ranking")
 RANKS = ("area", "final")
-PLANS = ({"options", "grid"}, {"options", "seeds"}, {"options", "grid", "seeds"})
+PLAN = {"options", "grid", "seeds", "script"}
 # Runs that differ in these alone have the same numbers, as far as both go: the entries of env are
 # those that other entries are or were read from, the last is how Q networks are called.
 NOT_THE_RUN = (
@@ -84,8 +84,8 @@ class Study:
     title: str
     tasks: tuple[str, ...]
     methods: Mapping[str, str | Mapping[str, Any]]
-    """Options of the script; or a mapping with these, and a ``grid`` of values of further options
-    or ``seeds`` of its own."""
+    """Options of the script; or a mapping with these, and a ``grid`` of values of further options,
+    or ``seeds`` or a ``script`` of its own."""
     seeds: tuple[int, ...]
     about: str = ""
     kind: str = "curves"
@@ -233,7 +233,7 @@ class Manifest:
         return [
             Cell(
                 study=study.name,
-                task=task,
+                task=_task_of(plan, task),
                 method=method,
                 setting=setting,
                 options=(*shlex.split(task.options or f"env={task.name}"), *options),
@@ -279,6 +279,11 @@ class Manifest:
 def _steps_of(study: Study, task: Task) -> int:
     own = study.steps
     return (own.get(task.name) if isinstance(own, Mapping) else own) or task.steps
+
+
+def _task_of(plan: str | Mapping[str, Any], task: Task) -> Task:
+    own = None if isinstance(plan, str) else plan.get("script")
+    return task if own is None else dataclasses.replace(task, script=own)
 
 
 def _seeds_of(plan: str | Mapping[str, Any]) -> tuple[int, ...]:
@@ -364,9 +369,13 @@ def _add(known: dict[str, Any], path: Path, entry: Any) -> None:
 def _read_task(where: str, name: str, entry: object) -> Task:
     task = _read(Task, where, name, entry)
     _check_steps(where, task.steps)
-    if not (SCRIPTS / task.script).is_file():
-        raise ValueError(f"{where}: there is no script {task.script} in {SCRIPTS.name}.")
+    _check_script(where, task.script)
     return task
+
+
+def _check_script(where: str, script: str) -> None:
+    if not (SCRIPTS / script).is_file():
+        raise ValueError(f"{where}: there is no script {script} in {SCRIPTS.name}.")
 
 
 def _read_study(where: str, name: str, entry: object, tasks: Mapping[str, Task]) -> Study:
@@ -396,15 +405,13 @@ def _read_study(where: str, name: str, entry: object, tasks: Mapping[str, Task])
         if number is not None:
             _check_steps(where, number)
     for method, plan in study.methods.items():
-        if not isinstance(plan, str) and not {"options"} < set(plan) <= {
-            "options",
-            "grid",
-            "seeds",
-        }:
+        if not isinstance(plan, str) and not {"options"} < set(plan) <= PLAN:
             raise ValueError(
                 f"{where}: method {method} must be options of the script, or a mapping with "
-                f"options and grid or seeds, got {plan!r}."
+                f"options and grid, seeds or script, got {plan!r}."
             )
+        if not isinstance(plan, str) and "script" in plan:
+            _check_script(where, plan["script"])
         if study.kind == "curves" and not isinstance(plan, str) and "grid" in plan:
             raise ValueError(
                 f"{where}: method {method} has a grid, which needs kind: ranking or heat_map."

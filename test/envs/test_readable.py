@@ -166,12 +166,20 @@ def test_what_is_no_environment_is_refused():
 
 def test_minigrid_is_read_with_its_mission():
     pytest.importorskip("minigrid")
-    env = readable(gym.make("minigrid:MiniGrid-DoorKey-5x5-v0"))
+    env = readable(gym.make("minigrid:MiniGrid-GoToDoor-5x5-v0"))
     seen, _ = env.reset(seed=0)
     assert seen.dtype == np.float32
     letters = seen[7 * 7 * 3 :].reshape(96, 28)
     mission = "".join((*map(chr, range(97, 123)), " ", ",")[i] for i in letters.argmax(1))
-    assert mission.startswith("use the key to open the door and then get to the goal")
+    assert mission.startswith("go to the ")
+
+
+def test_a_mission_that_is_always_the_same_is_not_read():
+    pytest.importorskip("minigrid")
+    env = gym.make("minigrid:MiniGrid-DoorKey-5x5-v0")
+    seen, _ = readable(env).reset(seed=0)
+    assert seen.dtype == np.float32
+    assert seen.tolist() == env.reset(seed=0)[0]["image"].flatten().tolist()
 
 
 def test_an_episode_of_choices_and_numbers_can_be_played_again():

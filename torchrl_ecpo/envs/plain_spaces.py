@@ -28,7 +28,8 @@ def readable(env: gym.Env) -> gym.Env:
       ``Tuple`` of all these and of boxes, are flattened; so is a box of another shape. If all are
       integers within bounds below 256, they are scaled to [0, 1].
     - Bytes from 0 to 255 in two or three dimensions are pixels, ``[C, H, W]``.
-    - What a MiniGrid task shows, and its mission, go through MiniGrid's ``FlatObsWrapper``.
+    - What a MiniGrid task shows is flattened, and its mission too, by MiniGrid's
+      ``FlatObsWrapper``, unless it is always the same.
 
     An action becomes one choice (``Discrete``), several (``MultiDiscrete``), or a vector of bounded
     numbers (``Box``), whichever way ``Dict`` and ``Tuple`` arrange them. One of both choices and
@@ -61,10 +62,15 @@ def readable(env: gym.Env) -> gym.Env:
 def _with_plain_observations(env: gym.Env) -> gym.Env:
     space = env.observation_space
     if _has_mission(space):
-        from minigrid.wrappers import FlatObsWrapper
+        from minigrid.wrappers import FlatObsWrapper, ImgObsWrapper
 
+        mission: Any = space["mission"]  # pyright: ignore[reportIndexIssue] - it is a Dict
+        if mission.ordered_placeholders is None:  # it is always the same
+            flat = wrappers.FlattenObservation(ImgObsWrapper(env))
+        else:
+            flat = FlatObsWrapper(env)
         # Not scaled: what it shows has numbers up to 10, and its letters are one-hot.
-        return wrappers.DtypeObservation(FlatObsWrapper(env), np.float32)
+        return wrappers.DtypeObservation(flat, np.float32)
     if _is_image(space):
         return _with_channels_first(env)
     images = [part for part in _parts(space) if _is_image(part)]

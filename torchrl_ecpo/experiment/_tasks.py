@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.wrappers import FrameStackObservation
 
 from torchrl_ecpo.envs import readable
 
@@ -34,11 +35,17 @@ def open_raw_task(name: str, **options: Any) -> gym.Env:
         ) from error
 
 
-def open_task(name: str, **options: Any) -> gym.Env:
-    """A task of gymnasium, with spaces that a network can read and play; likewise."""
+def open_task(name: str, window: int = 1, **options: Any) -> gym.Env:
+    """A task of gymnasium, with spaces that a network can read and play; likewise.
+
+    With a `window` it shows the last observations; those before the first are 0.
+    """
     env = open_raw_task(name, **options)
     try:
-        return readable(env)
+        env = readable(env)
+        if window == 1:
+            return env
+        return readable(FrameStackObservation(env, window, padding_type="zero"))
     except ValueError as error:
         raise ValueError(f"env.name: {error}") from error
 
