@@ -66,7 +66,9 @@ METHOD_COLOURS = {
     **dict.fromkeys(("pmd", "pmdac", "squaredpmd", "kimispmd", "modeseeking"), PURPLE),
     **dict.fromkeys(("nocontrolvariate", "tau02", "lr003", "k5andm2"), PURPLE),
     **dict.fromkeys(("repsentropy", "lstm", "aselsewhereat1e3"), BROWN),
-    "smallstartat3e4": BLUE,
+    **dict.fromkeys(("smallstartat3e4", "ofthegroup", "windowoffour"), BLUE),
+    **dict.fromkeys(("ofthebatch", "memoryless"), GREEN),
+    "ppo": BROWN,
 }
 """The colour of a method in every picture, by the letters and digits of its name."""
 
