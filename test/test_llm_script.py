@@ -233,3 +233,12 @@ def test_the_page_says_what_the_search_found(modules):
         assert min(best["pass_at_64"][method, "0.00025"]) > start["pass_at_64"]
     assert max(best["pass_at_64"]["GRPO", "0.0005"]) < 0.9 * start["pass_at_64"]
     assert max(best["pass_at_64"]["ECPO", "0.0005"]) > 0.95 * start["pass_at_64"]
+    rows = comparison.table("llm_comparison") + comparison.table("llm_by_trl")
+    assert len(rows) == 5
+    assert all(row in page for row in rows)
+    ends = {
+        method: [comparison.at_the_end(run) for run in seeds]
+        for (_, method, _), seeds in comparison.read_runs("llm_comparison").items()
+    }
+    for ours, theirs in zip(ends["ECPO"], ends["GRPO"], strict=True):
+        assert ours["pass_at_1"] < theirs["pass_at_1"]
