@@ -446,7 +446,7 @@ def test_a_task_whose_package_is_not_there_says_so():
 
 
 def test_a_task_is_opened_no_more_often_than_it_is_played(script_modules, monkeypatch):
-    """Twice at the door, and for the ten copies of the evaluation; the vector has its own."""
+    """Twice at the door, and for the ten copies of the evaluation and their specs."""
     is_plain.cache_clear()
     opened, open_raw_task = [], _tasks.open_raw_task
     monkeypatch.setattr(
@@ -456,7 +456,7 @@ def test_a_task_is_opened_no_more_often_than_it_is_played(script_modules, monkey
     script_modules("utils").check_config(config)
     assert len(opened) == 2
     script_modules("tasks").make_task(config)
-    assert len(opened) == 2 + 10
+    assert len(opened) == 2 + 11
 
 
 def test_a_run_without_weights_or_entropy_says_so_once(script_modules, capsys):
