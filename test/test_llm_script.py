@@ -240,5 +240,7 @@ def test_the_page_says_what_the_search_found(modules):
         method: [comparison.at_the_end(run) for run in seeds]
         for (_, method, _), seeds in comparison.read_runs("llm_comparison").items()
     }
-    for ours, theirs in zip(ends["ECPO"], ends["GRPO"], strict=True):
-        assert ours["pass_at_1"] < theirs["pass_at_1"]
+    pairs = list(zip(ends["ECPO"], ends["GRPO"], strict=True))
+    for name, above, level in (("pass_at_1", 0, 1), ("pass_at_64", 3, 0), ("distinct_right", 2, 0)):
+        assert sum(ours[name] > theirs[name] for ours, theirs in pairs) == above
+        assert sum(ours[name] == theirs[name] for ours, theirs in pairs) == level
