@@ -326,6 +326,22 @@ def test_entries_that_are_no_tensors_are_refused():
         collect(env)
 
 
+def test_an_index_is_refused_where_one_hot_actions_are_read():
+    """The environment would play action 0 whatever the policy chose."""
+    env = GroupedEnv(lambda: GymEnv("CartPole-v1"), num_groups=2, group_size=3)
+    network = TensorDictModule(nn.Linear(4, 2), ["observation"], ["logits"])
+    actor = ProbabilisticActor(
+        network,
+        ["logits"],
+        distribution_class=torch.distributions.Categorical,
+        return_log_prob=True,
+    )
+    collector = TrajectoryGroupCollector(env, actor, num_groups=2, group_size=3)
+    message = r"writes 'action' of shape \(2, 3\).*is OneHot of shape \(2, 3, 2\)"
+    with shut_down(collector), pytest.raises(ValueError, match=message):
+        next(iter(collector))
+
+
 def test_a_batch_is_sampled_from_the_reference():
     policy = linear_policy(1.0)
     collector = TrajectoryGroupCollector(Countdown(), policy, num_groups=2, group_size=3)

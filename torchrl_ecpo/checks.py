@@ -42,7 +42,8 @@ def check_kind(name: str, value: Any, *kinds: Any) -> None:
     """Refuse what is an object of none of the classes."""
     if not isinstance(value, kinds):
         expected = " or ".join("None" if kind is NoneType else kind.__name__ for kind in kinds)
-        raise TypeError(f"{name} must be a {expected}, got {described(value)}.")
+        article = "an" if expected[0] in "AEIOUaeiou" else "a"
+        raise TypeError(f"{name} must be {article} {expected}, got {described(value)}.")
 
 
 def check_network(name: str, network: Any) -> None:

@@ -234,7 +234,7 @@ def test_bad_input(make, sizes, match):
         ("CartPol-v1", (1, 2), "env='CartPol-v1' is no task of gymnasium: .*doesn't exist"),
         (3, (1, 2), "env must be an id .* or a function that makes a copy, got 3"),
         (GymEnv("CartPole-v1"), (1, 2), "env must be .* a function that makes a copy"),
-        (lambda: None, (1, 2), "What env makes must be a Env or EnvBase, got None"),
+        (lambda: None, (1, 2), "What env makes must be an Env or EnvBase, got None"),
     ],
 )
 def test_bad_input_of_the_front(make, sizes, match):

@@ -160,7 +160,7 @@ def test_what_cannot_be_read_is_refused_by_name(options, message):
 
 
 def test_what_is_no_environment_is_refused():
-    with pytest.raises(TypeError, match="env must be a Env, got str"):
+    with pytest.raises(TypeError, match="env must be an Env, got str"):
         readable("CartPole-v1")  # pyright: ignore
 
 

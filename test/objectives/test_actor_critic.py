@@ -56,6 +56,8 @@ from trajectory_problems import MASK, OBSERVATION, make_actor
 
 from torchrl_ecpo import (
     ActorCriticLoss,
+    DiscreteECACLoss,
+    DiscretePMDACLoss,
     ECACLoss,
     PolyakAverage,
     TemperatureScheduler,
@@ -1080,12 +1082,22 @@ def test_policies_of_another_kind(case):
     other = make_networks("tanh_normal" if case.is_discrete else "categorical").actor
     own, says = ("actions with rsample", "read") if case.is_discrete else ("one of n", "write")
     for networks.actor, message in (
-        (other, f"For a policy over {own}.* qvalue_network must {says}"),
+        (
+            other,
+            f"For a policy over {own}.* qvalue_network must {says}|is for policies over one of n",
+        ),
         (coins, "got Bernoulli|For a policy over"),
         (make_actor("composite"), "got CompositeDistribution.*hybrid ones are for the losses of g"),
     ):
         with pytest.raises(ValueError, match=message):
             case.build(networks)(_batch(case))
+
+
+@pytest.mark.parametrize("kind", [DiscreteECACLoss, DiscretePMDACLoss])
+def test_a_loss_over_choices_takes_no_other_policy(kind):
+    networks = make_networks("tanh_normal")
+    with pytest.raises(ValueError, match=f"{kind.__name__} is for policies over one of n actions"):
+        kind(networks.actor, networks.qvalues)
 
 
 @pytest.mark.parametrize(

@@ -106,7 +106,7 @@ class GroupPlayer:
         if not batch or batch[-1] != self.group_size:
             raise ValueError(
                 f"The environment must have the batch size [*B, group_size={self.group_size}], got "
-                f"{tuple(batch)}. GroupedEnv makes groups of any environment."
+                f"{tuple(batch)}. make_grouped_env makes groups of any environment."
             )
         if self.num_groups % (batch.numel() // self.group_size):
             raise ValueError(
@@ -241,11 +241,24 @@ class GroupPlayer:
             return self.policy(seen)
         return self.policy(seen.to(self.policy_device)).to(rows.device)
 
+    def _check_actions(self, acted: TensorDictBase) -> None:
+        """Refuse an index where the environment reads one-hot, which it would take for another."""
+        for key, spec in self.env.full_action_spec.items(True, True):
+            action = acted.get(key, None)
+            if action is not None and action.shape != spec.shape:
+                raise ValueError(
+                    f"The policy writes {key!r} of shape {tuple(action.shape)}, but the action of "
+                    f"the environment is {type(spec).__name__} of shape {tuple(spec.shape)}. An "
+                    "index (Categorical) goes with GymEnv(..., categorical_action_encoding=True), "
+                    "OneHotCategorical with GymEnv(...)."
+                )
+
     def _set_inputs(
         self, root: TensorDictBase, acted: TensorDictBase, places: tuple[Tensor, Tensor] | None
     ) -> TensorDictBase:
         """Let the rows act that go on; the others act as some other one, to no effect."""
         if self._flow is None:
+            self._check_actions(acted)
             return root.update(acted.select(*_acted_on(self.env), strict=False))
         for key in self._flow.inputs:
             value = acted.get(key)

@@ -261,7 +261,8 @@ def gaussian_parameters(distribution: Distribution) -> tuple[Tensor, Tensor]:
     if not isinstance(normal, Normal):
         raise ValueError(
             "This projection needs a diagonal Gaussian policy, transformed (TanhNormal) or not, "
-            f'got {type(distribution).__name__}. ECACLoss(projection="paper") takes any.'
+            f"got {type(distribution).__name__}. Discrete actions belong to DiscreteECACLoss; "
+            'ECACLoss(projection="paper") takes any policy with rsample.'
         )
     return normal.loc, normal.scale
 

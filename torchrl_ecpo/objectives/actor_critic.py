@@ -145,6 +145,8 @@ class ActorCriticLoss(PolicyLoss):
         ['loss_actor', 'loss_qvalue']
     """
 
+    takes_choices_only: ClassVar[bool] = False
+    """Whether the policy must be over one of n actions."""
     has_soft_value: ClassVar[bool] = True
     """Whether a state is worth its soft value (Eq. 8), or else the reference's mean of Q."""
 
@@ -840,6 +842,12 @@ class ActorCriticLoss(PolicyLoss):
             raise unreadable("loss", transitions, list(entries), error) from error
 
     def _check_kind(self, is_discrete: bool) -> None:
+        if self.takes_choices_only and not is_discrete:
+            name = type(self).__name__
+            raise ValueError(
+                f"{name} is for policies over one of n actions (Categorical, OneHotCategorical): "
+                f"for others take {name.removeprefix('Discrete')}."
+            )
         if is_discrete == self._reads_action:
             network = self.qvalue_network
             policy = "one of n actions (Categorical)" if is_discrete else "actions with rsample"

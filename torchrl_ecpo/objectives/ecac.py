@@ -293,6 +293,8 @@ class DiscreteECACLoss(ECACLoss):
         >>> loss_actor.backward()
     """
 
+    takes_choices_only = True
+
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,

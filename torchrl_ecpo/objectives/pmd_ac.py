@@ -125,6 +125,8 @@ class DiscretePMDACLoss(PMDACLoss):
         ['loss_actor', 'loss_qvalue', 'ESS']
     """
 
+    takes_choices_only = True
+
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
