@@ -164,7 +164,7 @@ def test_a_task_of_popgym_is_played_with_and_without_memory(tmp_path):
         "num_groups=5",
         "group_size=2",
         "env.max_steps=6",
-        "evaluation_interval=1",
+        "evaluation.interval=1",
         f"hydra.sweep.dir={tmp_path}",
         "hydra.sweep.subdir=${policy.name}",
     )
@@ -175,7 +175,7 @@ def test_a_task_of_popgym_is_played_with_and_without_memory(tmp_path):
 
 
 def test_a_window_shows_the_last_observations(script_modules):
-    env, one = (script_modules("tasks").make_copy("CartPole-v1", n) for n in (3, 1))
+    env, one = (script_modules("tasks").open_task("CartPole-v1", n) for n in (3, 1))
     seen = [one.reset(seed=1)[0], *(one.step(0)[0] for _ in range(2))]
     assert env.reset(seed=1)[0].tolist() == [0.0] * 8 + seen[0].tolist()
     env.step(0)
@@ -184,7 +184,7 @@ def test_a_window_shows_the_last_observations(script_modules):
 
 def test_an_lstm_tells_an_observation_by_what_came_before(script_modules):
     tasks = script_modules("tasks")
-    env = GymWrapper(tasks.make_copy("CartPole-v1"), categorical_action_encoding=True)
+    env = GymWrapper(tasks.open_task("CartPole-v1"), categorical_action_encoding=True)
     actor = tasks.make_gym_policy(env, [8], units=4)
     steps = TensorDict(observation=torch.zeros(2, 3, 4), batch_size=[2, 3])
     steps["observation"][1, 0] = 1.0
