@@ -32,8 +32,10 @@ class GroupedEnv(SeededGroups):
     ``InitTracker()``, ``DoubleToFloat()``) like any other environment.
 
     Args:
-        create_env_fn: makes one copy, for example ``lambda: GymEnv("CartPole-v1")``; its batch size
-            must be empty.
+        create_env_fn: makes one copy, for example
+            ``lambda: GymEnv("CartPole-v1", categorical_action_encoding=True)``; its batch size must
+            be empty. Without ``categorical_action_encoding=True`` discrete actions are one-hot,
+            and the numbers of a ``Categorical`` policy are misread.
         num_groups: `G`.
         group_size: `K`, at least 2.
         parallel: whether each copy runs in a process of its own (``ParallelEnv``) instead of one
@@ -54,7 +56,8 @@ class GroupedEnv(SeededGroups):
 
     Examples:
         >>> from torchrl.envs import GymEnv
-        >>> env = GroupedEnv(lambda: GymEnv("CartPole-v1"), num_groups=2, group_size=3)
+        >>> copy = lambda: GymEnv("CartPole-v1", categorical_action_encoding=True)
+        >>> env = GroupedEnv(copy, num_groups=2, group_size=3)
         >>> start = env.reset()
         >>> start["observation"].shape, start["group"].shape
         (torch.Size([2, 3, 4]), torch.Size([2, 3]))

@@ -97,7 +97,8 @@ class VectorGroupedEnv(SeededGroups):
 
     Args:
         env: an id of gymnasium's, or what makes a copy. A copy that needs arguments or wrappers
-            takes a function: ``lambda: FlattenObservation(gym.make("Taxi-v3"))``.
+            takes a function: ``lambda: readable(gym.make("Taxi-v4"))``, with
+            :func:`~torchrl_ecpo.envs.readable`.
         num_groups: `G`.
         group_size: `K`, at least 2.
         parallel: whether each copy runs in a process of its own. Default: False.
