@@ -387,7 +387,7 @@ def test_mixed_rows(model):
         ECPOLoss(actor)(batch.reshape(2, 3))
 
 
-def test_other_tokens(model):
+def test_other_tokens(model, monkeypatch):
     """A mask of another shape, as of a text that is divided anew."""
     actor, batch = make(model, pad_output=True)
     loss_module = ECPOLoss(actor)
@@ -395,6 +395,11 @@ def test_other_tokens(model):
     batch["tokens", "other"] = batch[FULL][:, 1:]
     with pytest.raises(ValueError, match="divided into other tokens"):
         loss_module(batch)
+    divided = actor.get_dist(batch, mask_key=("masks", "all_attention_mask"), padding_side="left")
+    monkeypatch.setattr(actor, "get_dist", lambda *_, **__: divided)
+    batch[FULL] = batch["tokens", "other"]
+    with pytest.raises(ValueError, match="divided into other tokens"):
+        record_log_probs(actor, batch)
 
 
 @pytest.mark.parametrize(

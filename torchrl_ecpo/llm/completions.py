@@ -175,7 +175,7 @@ def record_log_probs(actor: Any, tensordict: TensorDictBase) -> TensorDictBase:
     _check_dropout(actor)
     rows = tensordict.reshape(-1)
     logits, attention = _logits(actor, rows)
-    tokens = _padded(rows, (actor.tokens_key, "full"), 0)
+    tokens = _tokens(rows, (actor.tokens_key, "full"), attention)
     log_prob = _log_prob(logits, tokens, _with_context(attention, attention))
     key = (actor.log_probs_key, "full")
     lengths = [len(row) for row in _entries(rows, (actor.tokens_key, "full"))]
@@ -213,13 +213,7 @@ def read_completions(
     check_real(reward_key, returns)
     returns = returns.reshape(len(returns), -1).sum(-1)
     logits, attention = _logits(actor, rows)
-    tokens = _padded(rows, tokens_key, 0)
-    if tokens.shape != attention.shape:
-        raise ValueError(
-            f"The actor evaluates {attention.shape[-1]} tokens, but {tokens_key!r} has "
-            f"{tokens.shape[-1]}: a text was divided into other tokens than those that were "
-            "sampled. Build the actor with input_mode='tokens'."
-        )
+    tokens = _tokens(rows, tokens_key, attention)
     if mask_key == "auto":
         mask = attention & _after_prompt(rows, tokens, tokens_key, (actor.tokens_key, "prompt"))
     elif mask_key is None:
@@ -291,6 +285,18 @@ def _padded(rows: Any, key: NestedKey, fill: float) -> Tensor:
 def _entries(rows: Any, key: NestedKey) -> Any:
     """An entry row by row, each with the padding that it has itself; None if it is missing."""
     return rows.get(key, None, as_list=True)
+
+
+def _tokens(rows: TensorDictBase, key: NestedKey, attention: Tensor) -> Tensor:
+    """The tokens ``[B, L]``, which must be those that the actor has evaluated."""
+    tokens = _padded(rows, key, 0)
+    if tokens.shape != attention.shape:
+        raise ValueError(
+            f"The actor evaluates {attention.shape[-1]} tokens, but {key!r} has "
+            f"{tokens.shape[-1]}: a text was divided into other tokens than those that were "
+            "sampled. Build the actor with input_mode='tokens'."
+        )
+    return tokens
 
 
 def _logits(actor: Any, rows: TensorDictBase) -> tuple[Tensor, Tensor]:
