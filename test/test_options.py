@@ -240,6 +240,7 @@ def test_hydra_s_own_flags_are_its_own(monkeypatch, options):
         ("loss.control_variate=no", "ecpo.py: loss.control_variate must be true or false"),
         ("compile=true seeds=[0,1]", "ecpo.py: compile=true is for single runs"),
         ("compile=true env=copy", "compile=true is for tasks of the kinds ('bandit', 'gym')"),
+        ("compile=true env=bandit +policy=window seeds=[0,1]", "\necpo.py: policy= is for the alg"),
         ("stack=['seed=0','loss.tua=1']", "ecpo.py: There is no option loss.tua"),
         ("env=copy policy=gru", "Could not find 'policy/gru' Available options in 'policy': lstm"),
         ("form=book", "Could not find 'form/book' Available options in 'form': paper recipe"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -47,28 +47,34 @@ PATIENCE = 10  # batches running
 
 
 def check_config(config: DictConfig) -> None:
-    """Refuse options that do not go together."""
+    """Refuse options that do not go together, with a line for each."""
     loss_class(config.loss)
     if config.env.kind == "gym":
         is_plain(config.env.name)
+    if problems := [*_problems(config)]:
+        raise ValueError("\n".join(problems))
+
+
+def _problems(config: DictConfig) -> Iterator[str]:
+    kind = config.env.kind
     if config.compile and not (config.seeds is None and config.stack is None):
-        raise ValueError(
+        yield (
             "compile=true is for single runs. Leave out compile, or seeds and stack: --multirun "
             "starts a process for each run."
         )
-    if config.compile and config.env.kind not in COMPILABLE:
-        raise ValueError(
-            f"compile=true is for tasks of the kinds {COMPILABLE}, got env.kind="
-            f"{config.env.kind!r}, whose policy computes each distinct history once: how much that "
-            "is differs from batch to batch. Leave out compile."
+    if config.compile and kind not in COMPILABLE:
+        yield (
+            f"compile=true is for tasks of the kinds {COMPILABLE}, got env.kind={kind!r}, whose "
+            "policy computes each distinct history once: how much that is differs from batch to "
+            "batch. Leave out compile."
         )
-    if "policy" in config and config.env.kind not in ("algorithmic", "gym"):
-        raise ValueError(
-            "policy= is for the algorithmic tasks and env=popgym, got "
-            f"env.kind={config.env.kind!r}, which has a policy of its own. Leave out policy."
+    if "policy" in config and kind not in ("algorithmic", "gym"):
+        yield (
+            f"policy= is for the algorithmic tasks and env=popgym, got env.kind={kind!r}, which "
+            "has a policy of its own. Leave out policy."
         )
-    if config.env.kind == "gym" and "policy" in config and config.policy.tables:
-        raise ValueError(
+    if kind == "gym" and "policy" in config and config.policy.tables:
+        yield (
             "policy.tables=true is for the algorithmic tasks, got env.kind='gym'. Choose "
             "policy=window."
         )
