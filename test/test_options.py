@@ -234,13 +234,20 @@ def test_hydra_s_own_flags_are_its_own(monkeypatch, options):
     check_command_line(str(SCRIPTS / "ecpo/ecpo.py"), lambda config, given: None)
 
 
+def test_all_that_does_not_go_together_is_said(tmp_path):
+    given = ("compile=true", "env=bandit", "+policy=window", "seeds=[0,1]")
+    process = run_script(tmp_path, SCRIPTS / "ecpo/ecpo.py", *given)
+    said = ("compile=true is for single runs", "policy= is for the algorithmic tasks")
+    lines = process.stderr.splitlines()
+    assert all(line.startswith(f"ecpo.py: {one}") for line, one in zip(lines, said, strict=True))
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ("loss.control_variate=no", "ecpo.py: loss.control_variate must be true or false"),
         ("compile=true seeds=[0,1]", "ecpo.py: compile=true is for single runs"),
         ("compile=true env=copy", "compile=true is for tasks of the kinds ('bandit', 'gym')"),
-        ("compile=true env=bandit +policy=window seeds=[0,1]", "\necpo.py: policy= is for the alg"),
         ("stack=['seed=0','loss.tua=1']", "ecpo.py: There is no option loss.tua"),
         ("env=copy policy=gru", "Could not find 'policy/gru' Available options in 'policy': lstm"),
         ("form=book", "Could not find 'form/book' Available options in 'form': paper recipe"),
