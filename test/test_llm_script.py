@@ -214,9 +214,11 @@ def test_the_page_says_what_was_measured():
     )
 
 
-def test_the_page_says_what_the_search_found(modules):
+def test_the_page_says_what_the_search_found(modules, tmp_path):
     comparison = modules("comparison")
     page = (Path(__file__).parents[1] / "docs/tutorials/language_models.md").read_text()
+    comparison.draw(tmp_path / "llm_search.svg")
+    assert "../figures/llm_search.svg" in page
     rows = comparison.table("llm_search")
     assert len(rows) == 16
     assert all(row in page for row in rows)

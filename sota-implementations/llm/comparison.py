@@ -7,9 +7,10 @@ from collections import defaultdict
 from pathlib import Path
 from statistics import fmean, stdev
 
+import matplotlib
 from matplotlib.figure import Figure
 
-from torchrl_ecpo.experiment.figures import save_figure
+from torchrl_ecpo.experiment.figures import NEUTRAL, STYLE, colours_of, save_figure
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "sota-implementations/results/study"
@@ -62,22 +63,22 @@ def table(study: str) -> list[str]:
     return rows
 
 
+@matplotlib.rc_context(STYLE)
 def draw(path: Path) -> None:
     """pass@64 over pass@1 at the end of each setting, by method and learning rate."""
     figure = Figure(figsize=(6.5, 3.8), layout="constrained")
     axes, runs = figure.subplots(), read_runs("llm_search")
-    methods = list(dict.fromkeys(method for _, method, _ in runs))
+    colours = colours_of(dict.fromkeys(method for _, method, _ in runs))
     for (_, method, setting), (rows,) in runs.items():
         end, rate = at_the_end(rows), setting.split("optim.lr ")[1]
-        colour = f"C{methods.index(method)}"
         marker = "o" if rate == "0.00025" else "^"
-        axes.plot(end["pass_at_1"], end["pass_at_64"], marker, color=colour)
+        axes.plot(end["pass_at_1"], end["pass_at_64"], marker, color=colours[method])
     start = at_the_start(rows)
-    axes.plot(start["pass_at_1"], start["pass_at_64"], "k*", markersize=10)
-    for number, method in enumerate(methods):
-        axes.plot([], [], "s", color=f"C{number}", label=method)
-    for marker, label in {"ko": "rate 0.00025", "k^": "rate 0.0005", "k*": "start"}.items():
-        axes.plot([], [], marker, label=label)
+    axes.plot(start["pass_at_1"], start["pass_at_64"], "*", color=NEUTRAL, markersize=10)
+    for method, colour in colours.items():
+        axes.plot([], [], "s", color=colour, label=method)
+    for marker, label in {"o": "rate 0.00025", "^": "rate 0.0005", "*": "start"}.items():
+        axes.plot([], [], marker, color=NEUTRAL, label=label)
     axes.set(xlabel="pass@1", ylabel="pass@64", title="Countdown, 3,840 completions, one seed")
     figure.legend(loc="outside right upper")
     save_figure(figure, path)
