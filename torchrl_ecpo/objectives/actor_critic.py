@@ -363,7 +363,7 @@ class ActorCriticLoss(PolicyLoss):
         states = self.states(transitions, mask)
         if not self._reads_action:  # the network has valued all actions: it is not asked twice
             first = qvalues.detach()[:, : self.num_actor_states]
-            states.make_lift = partial(self.lift, qvalues=first)
+            states.make_lift = partial(self._lift_of_all, first)
         surrogate = self.project(states)
         own = {name: x for name, x in surrogate.metrics.items() if name != "kl_target_reference"}
         self._check_declared(surrogate.losses, own)
@@ -406,7 +406,6 @@ class ActorCriticLoss(PolicyLoss):
         reference: Distribution,
         qvalue_params: TensorDictParams | None = None,
         num_samples: int | None = None,
-        qvalues: Tensor | None = None,
     ) -> Lift:
         """Lift the reference policy at each state ``[*B]``: Eq. 8, by samples or over all actions.
 
@@ -415,17 +414,19 @@ class ActorCriticLoss(PolicyLoss):
             reference: the policy at these states.
             qvalue_params: of the Q networks; those that are trained by default.
             num_samples: M; ``num_action_samples`` by default.
-            qvalues: ``[N, *B, n]``, of all n actions, where they are known.
         """
         number = self.num_action_samples if num_samples is None else num_samples
         params = self.qvalue_network_params if qvalue_params is None else qvalue_params
         with torch.no_grad():
             actions = actions_of(reference, number)
-            if qvalues is None or isinstance(actions, SampledActions):
-                score = self.score_of(observations, actions, params)
-            else:
-                score = qvalues.amin(0).movedim(-1, 0)
-            return self.lifted(actions, score)
+            return self.lifted(actions, self.score_of(observations, actions, params))
+
+    def _lift_of_all(self, qvalues: Tensor, _: TensorDictBase, reference: Distribution) -> Lift:
+        """The same, of a policy over n actions, whose values ``[N, *B, n]`` are known."""
+        with torch.no_grad():
+            actions = actions_of(reference, 1)
+            self._check_kind(isinstance(actions, AllActions))
+            return self.lifted(actions, qvalues.amin(0).movedim(-1, 0))
 
     def lifted(self, actions: Actions, score: Tensor, slope: Tensor | None = None) -> Lift:
         """The lift, of actions that have been valued."""

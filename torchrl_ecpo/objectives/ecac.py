@@ -186,7 +186,6 @@ class ECACLoss(ActorCriticLoss):
         reference: Distribution,
         qvalue_params: TensorDictParams | None = None,
         num_samples: int | None = None,
-        qvalues: Tensor | None = None,
     ) -> Lift:
         """The base's; with ``projection="gradient"``, where the policy learns, by pairs and slopes.
 
@@ -194,7 +193,7 @@ class ECACLoss(ActorCriticLoss):
         of samples is left to the loss.
         """
         if self.projection != "gradient" or num_samples is not None:
-            return super().lift(observations, reference, qvalue_params, num_samples, qvalues)
+            return super().lift(observations, reference, qvalue_params, num_samples)
         params = (self.qvalue_network_params if qvalue_params is None else qvalue_params).data
         _, tau_prime = self.temperatures()
 
