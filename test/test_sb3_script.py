@@ -14,7 +14,7 @@ from processes import run_script
 from torchrl_ecpo.envs import DeepSeaEnv
 from torchrl_ecpo.experiment import read_metrics
 
-pytest.importorskip("stable_baselines3")
+pytest.importorskip("sb3_contrib")
 PPO = Path(__file__).parents[1] / "sota-implementations/sb3/ppo.py"
 
 
@@ -31,7 +31,7 @@ def run_ppo(directory, *options):
     return read_metrics(directory), json.loads((directory / "summary.json").read_text())
 
 
-@pytest.mark.parametrize("task", ["frozenlake", "mountaincar", "minigrid"])
+@pytest.mark.parametrize("task", ["frozenlake", "mountaincar", "minigrid", "popgym"])
 def test_a_run_has_rows_of_so_many_episodes(tmp_path, task):
     metrics, summary = run_ppo(
         tmp_path, f"env={task}", "total_trajectories=20", "log_interval=10", "ppo.n_steps=16"

@@ -1,5 +1,7 @@
 """PPO of Stable-Baselines3 on the tasks of exploration: the outside reference of the study.
 
+On ``env=popgym`` it is sb3-contrib's ``RecurrentPPO``, whose policy has an LSTM.
+
 ``python ppo.py env=deep_sea seed=1`` with the extra ``bench``. It leaves the files of a run of
 ``ecpo.py``; one that is stopped begins anew.
 """
@@ -15,6 +17,7 @@ import hydra
 import numpy as np
 import torch
 from omegaconf import DictConfig
+from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
@@ -98,7 +101,8 @@ def main(config: DictConfig) -> None:
     envs: Any = DummyVecEnv([partial(make_env, config)] * config.n_envs)
     if config.normalize:
         envs = VecNormalize(envs, gamma=config.ppo.gamma)
-    model = PPO("MlpPolicy", envs, seed=config.seed, device="cpu", **config.ppo)
+    method, policy = (RecurrentPPO, "MlpLstmPolicy") if config.recurrent else (PPO, "MlpPolicy")
+    model = method(policy, envs, seed=config.seed, device="cpu", **config.ppo)
     run = Run(
         config,
         total=config.total_trajectories,
