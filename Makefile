@@ -36,7 +36,7 @@ demo: install ## compare ECPO, UREX and Dr.GRPO on Reverse, and ECPO, UREX and M
 	@$(RUN) -m torchrl_ecpo.experiment.compare runs/demo/bandit --title "10,000-armed bandit"
 
 demo-llm: install ## teach a small language model Countdown by ECPO and by GRPO, and draw its pass@64
-	$(RUN) sota-implementations/llm/llm.py --multirun task=countdown loss=ecpo,grpo \
+	$(RUN) sota-implementations/llm/llm.py --multirun env=countdown loss=ecpo,grpo \
 		hydra.sweep.dir=runs/demo/llm
 	@$(RUN) -m torchrl_ecpo.experiment.compare runs/demo/llm --metric pass_at_64 \
 		--title "Countdown" --x-label "completions"

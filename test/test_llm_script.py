@@ -93,7 +93,7 @@ def test_the_entropy_is_that_of_the_completions(modules):
 def test_every_loss_trains(tmp_path):
     run_llm(
         tmp_path,
-        *("--multirun", "loss=ecpo,pmd,tpo,grpo", "task=sums", f"hydra.sweep.dir={tmp_path}"),
+        *("--multirun", "loss=ecpo,pmd,tpo,grpo", "env=sums", f"hydra.sweep.dir={tmp_path}"),
         "hydra.sweep.subdir=${loss.name}",
     )
     start = {}
@@ -116,8 +116,8 @@ def test_trl_trains_the_model_of_another_run(tmp_path):
     pytest.importorskip("trl")
     start, trained = tmp_path / "start", tmp_path / "trained"
     start.mkdir(), trained.mkdir()
-    run_llm(start, "task=sums", "total_completions=0", f"hydra.run.dir={start}")
-    options = ("task=sums", "loss=trl", f"model.path={start}/model", "supervised.steps=0")
+    run_llm(start, "env=sums", "total_completions=0", f"hydra.run.dir={start}")
+    options = ("env=sums", "loss=trl", f"model.path={start}/model", "supervised.steps=0")
     script = SCRIPT.with_name("by_trl.py")
     run_llm(trained, *options, f"hydra.run.dir={trained}", script=script)
     first, metrics = read_metrics(start), read_metrics(trained)
@@ -165,7 +165,8 @@ def test_a_model_of_ones_own(modules, monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ("task=chess", "task must be countdown or sums, got 'chess'."),
+        ("env=chess", "env must be countdown or sums, got 'chess'."),
+        ("task=sums", r"task is called env\."),
         ("group_size=1", "group_size must be an integer >= 2, got 1."),
         ("evaluation.completions=8", "evaluation.completions must be an integer >= 64, got 8."),
         ("model.path=nowhere", r"model.path=nowhere: it must be a directory with a model in \*."),
@@ -185,6 +186,16 @@ def test_what_is_wrong_is_named(modules, monkeypatch, tmp_path, options, message
             (directory / "tokenizer_config.json").unlink()
     with pytest.raises(ValueError, match=message):
         modules("utils").check_model(compose_options(SCRIPT.parent, [options]))
+
+
+def test_runs_of_the_comparison_are_those_of_its_cells_still(study):
+    """Their options had other names; one cell of each study."""
+    manifest = study.manifest.read_manifests([SCRIPT.with_name("comparison.yaml")])
+    for name, own in manifest.studies.items():
+        results = study.results.Results.read(study.results.RESULTS / "study" / name)
+        cell = manifest.cells(own)[0]
+        assert all(results.has(cell, seed) for seed in cell.seeds), name
+        assert len(study.results.read_cell(cell, results).runs) == len(cell.seeds)
 
 
 def test_the_page_says_what_was_measured():

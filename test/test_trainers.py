@@ -145,6 +145,15 @@ def test_unknown_options_are_refused(composed):
         instantiate(trainers.ECPOLossConfig, tau="hot", **networks(torchrl_ecpo.ECPOLoss))
 
 
+@pytest.mark.parametrize("loss_class", LOSSES, ids=lambda loss_class: loss_class.__name__)
+def test_a_loss_refuses_unknown_options_in_its_own_name(loss_class):
+    message = (
+        rf"^{loss_class.__name__} has no option 'foo', 'tou'; it has actor_network, .*reduction"
+    )
+    with pytest.raises(TypeError, match=message):
+        loss_class(**networks(loss_class), foo=1, reduction="mean", tou=1)
+
+
 class Optimising:
     """What of a trainer a hook sees."""
 

@@ -30,7 +30,7 @@ from torchrl.trainers.algorithms.configs import LossConfig
 import torchrl_ecpo
 from torchrl_ecpo.checks import as_float
 from torchrl_ecpo.objectives import ActorCriticLoss
-from torchrl_ecpo.objectives._base import PolicyLoss
+from torchrl_ecpo.objectives._base import PolicyLoss, options_of
 
 __all__ = [
     "DiscreteECACLossConfig",
@@ -114,26 +114,11 @@ def make_loss(loss_class: str, **options: Any) -> PolicyLoss:
         TypeError: for an option that it does not have.
     """
     kind = getattr(torchrl_ecpo, loss_class)
-    known = _options(kind)
-    if unknown := options.keys() - known.keys():
-        raise TypeError(f"{loss_class} has no option {min(unknown)!r}; it has {', '.join(known)}.")
     gamma = options.pop("gamma", None) if issubclass(kind, ActorCriticLoss) else None
     loss_module = kind(**options)
     if gamma is not None:
         loss_module.make_value_estimator(gamma=gamma)
     return loss_module
-
-
-def _options(kind: type[PolicyLoss]) -> dict[str, Any]:
-    """The options of a loss and their defaults: a class hands ``**options`` to its parent."""
-    options: dict[str, Any] = {}
-    for parent in kind.__mro__:
-        *parameters, last = inspect.signature(parent).parameters.values()
-        for one in parameters if last.kind is last.VAR_KEYWORD else (*parameters, last):
-            options.setdefault(one.name, MISSING if one.default is one.empty else one.default)
-        if last.kind is not last.VAR_KEYWORD:
-            break
-    return options | ({"gamma": None} if issubclass(kind, ActorCriticLoss) else {})
 
 
 def _register(name: str, kind: type[PolicyLoss]) -> Any:
@@ -143,9 +128,10 @@ def _register(name: str, kind: type[PolicyLoss]) -> Any:
         "_target_": "torchrl_ecpo.trainers.make_loss",
         "_convert_": "all",  # lists, such as GRPO's clip_epsilon, in Python's own
     }
+    options = options_of(kind) | ({"gamma": None} if issubclass(kind, ActorCriticLoss) else {})
     fields = [
-        (option, Any, field(default=default))
-        for option, default in (_options(kind) | constants).items()
+        (option, Any, field(default=MISSING if default is inspect.Parameter.empty else default))
+        for option, default in (options | constants).items()
     ]
     text = f"Hydra configuration of :class:`~torchrl_ecpo.{kind.__name__}`, with its options."
     namespace = {"__doc__": text, "__module__": __name__}

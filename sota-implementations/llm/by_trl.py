@@ -1,6 +1,6 @@
 """The same model, prompts and evaluation in TRL's GRPOTrainer, with its own loss: ``loss=trl``.
 
-``python by_trl.py task=countdown loss=trl seed=1``; the options are those of ``llm.py``.
+``python by_trl.py env=countdown loss=trl seed=1``; the options are those of ``llm.py``.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Logged(TrainerCallback):
 def main(config: DictConfig) -> None:
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
-    task = TASKS[config.task]
+    task = TASKS[config.env]
     model, tokenizer = make_model(config.model)
     policy = Policy(model, tokenizer, task)
     batch_size = config.num_prompts * config.group_size
@@ -51,7 +51,7 @@ def main(config: DictConfig) -> None:
         config,
         total=config.total_completions,
         unit="completions",
-        name=f"{config.task}/trl/seed_{config.seed}",
+        name=f"{config.env}/trl/seed_{config.seed}",
         shown=("pass_at_1", "pass_at_8", "pass_at_64", "distinct_right"),
     )
 

@@ -1,6 +1,6 @@
 """Train a language model on a task with verifiable answers, by ECPO or a rival of it.
 
-``python llm.py task=countdown loss=ecpo seed=1``; every option is in ``config/``.
+``python llm.py env=countdown loss=ecpo seed=1``; every option is in ``config/``.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def main(config: DictConfig) -> None:
     torch.set_num_threads(config.threads)
     checkpoints = Checkpoints(config)
     torch.manual_seed(config.seed)
-    task = TASKS[config.task]
+    task = TASKS[config.env]
     model, tokenizer = make_model(config.model)
     policy = Policy(model, tokenizer, task)
     loss_module = make_loss(config.loss, policy.actor)
@@ -40,7 +40,7 @@ def main(config: DictConfig) -> None:
         config,
         total=config.total_completions,
         unit="completions",
-        name=f"{config.task}/{config.loss.name}/seed_{config.seed}",
+        name=f"{config.env}/{config.loss.name}/seed_{config.seed}",
         shown=SHOWN,
     )
     with run, checkpoints.attach(run, progress, model=model, optimizer=optimizer):

@@ -279,6 +279,23 @@ def test_a_member_names_its_temperatures_once():
         TemperatureScheduler(loss, tau=linear(1.0, 0.0, 10))
 
 
+class Renaming(ECACLoss):
+    """Reads an option that its signature does not name."""
+
+    def __init__(self, actor: Any, qvalue: Any, **options: Any) -> None:
+        super().__init__(actor, qvalue, tau=options.pop("temperature"), **options)
+
+
+def test_a_member_may_read_what_its_signature_does_not_name():
+    networks = make_networks()
+    loss = Renaming(networks.actor, networks.qvalues, temperature=2.0)
+    assert_close(loss.temperature("tau").item(), 2.0)
+    with pytest.raises(TypeError, match="actor_network must have a get_dist method"):
+        Renaming(torch.nn.Linear(1, 1), networks.qvalues, temperature=2.0)
+    with pytest.raises(TypeError, match=r"^Renaming has no option .*'tua'; it has actor_network"):
+        Renaming(networks.actor, networks.qvalues, temperature=2.0, tua=1)
+
+
 class Seeing(TrajectoryGroupLoss):
     """Keeps what it is given."""
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -53,6 +55,10 @@ class PolicyLoss(LossModule):
     """Names of the further losses that a member returns; each begins with ``loss_``."""
     metrics: ClassVar[tuple[str, ...]] = ()
     """Names of the further metrics that it returns."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        cls.__init__ = _names_its_class(cls.__init__)
 
     def __init__(
         self,
@@ -316,6 +322,41 @@ class PolicyLoss(LossModule):
                     f"{of}. Mend the environment, the observations or the networks that it comes "
                     "from."
                 )
+
+
+def options_of(kind: type[PolicyLoss]) -> dict[str, Any]:
+    """The arguments of a loss and their defaults: a class hands ``**options`` to its parent."""
+    options: dict[str, Any] = {}
+    for parent in kind.__mro__:
+        if "__init__" in vars(parent):
+            _, *parameters = inspect.signature(parent.__init__).parameters.values()
+            packed = [
+                one for one in parameters if one.kind in (one.VAR_POSITIONAL, one.VAR_KEYWORD)
+            ]
+            own = {one.name: one.default for one in parameters if one not in packed}
+            options = {**own, **options}
+            if not packed:
+                break
+    return options
+
+
+def _names_its_class(init: Callable[..., None]) -> Callable[..., None]:
+    """Refuse unknown arguments in the name of the class that was called, not of a parent's."""
+
+    @wraps(init)
+    def named(self: PolicyLoss, *args: Any, **options: Any) -> None:
+        try:
+            init(self, *args, **options)
+        except TypeError as error:
+            known = options_of(type(self))
+            unknown = ", ".join(repr(name) for name in options if name not in known)
+            is_outermost = type(self).__init__ is named
+            if not (unknown and is_outermost and "unexpected keyword argument" in str(error)):
+                raise
+            message = f"{type(self).__name__} has no option {unknown}; it has {', '.join(known)}."
+            raise TypeError(message) from None
+
+    return named
 
 
 def _check_loaded(module: Any, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
