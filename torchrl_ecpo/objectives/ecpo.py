@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
@@ -14,7 +14,7 @@ from torchrl_ecpo.functional import (
     matched_temperature,
     mean_seeking_projection,
 )
-from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, Score, TrajectoryGroups
+from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, TrajectoryGroups
 
 __all__ = ["ECPOLoss"]
 
@@ -51,11 +51,7 @@ class ECPOLoss(LiftProjectLoss):
         control_variate: if True, the self-normalised ratios pi_theta/pi_bar are subtracted from
             the weights, which removes the drift of groups without a preference. Defaults to False
             (the paper).
-        score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
-        delay_actor: if True, the reference policy is the loss's own delayed copy of the actor, see
-            :class:`TrajectoryGroupLoss`. Defaults to False: the recorded log-probability is the
-            reference's, as in Algorithm 1.
-        reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
+        options: ``score``, ``delay_actor`` and ``reduction``, see :class:`TrajectoryGroupLoss`.
 
     Raises:
         ValueError: for an unknown `entropy`, for ``"matched"`` with ``score="return"``, and as
@@ -97,24 +93,14 @@ class ECPOLoss(LiftProjectLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         *,
-        tau: float = 0.5,
         tau_prime: float = 0.01,
         entropy: Literal["nats", "matched"] = "nats",
         control_variate: bool = False,
-        score: Score = "return",
-        delay_actor: bool = False,
-        reduction: Literal["none", "mean", "sum"] | None = None,
+        **options: Any,
     ) -> None:
-        super().__init__(
-            actor_network,
-            tau=tau,
-            tau_prime=tau_prime,
-            score=score,
-            delay_actor=delay_actor,
-            reduction=reduction,
-        )
+        super().__init__(actor_network, tau_prime=tau_prime, **options)
         check_choice("entropy", entropy, ("nats", "matched"))
-        if entropy == "matched" and score == "return":
+        if entropy == "matched" and self.score == "return":
             raise ValueError(
                 "entropy='matched' needs scores in deviations: score='group' or 'batch', got "
                 "score='return'."

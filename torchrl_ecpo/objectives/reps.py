@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Any
 
 from tensordict.nn import ProbabilisticTensorDictSequential
 
 from torchrl_ecpo.checks import as_float
 from torchrl_ecpo.functional import Surrogate, lift_divergence_estimate, self_normalised_weights
 from torchrl_ecpo.objectives.ecpo import ECPOLoss
-from torchrl_ecpo.objectives.trajectory import Score, TrajectoryGroups
+from torchrl_ecpo.objectives.trajectory import TrajectoryGroups
 
 __all__ = ["REPSLoss"]
 
@@ -37,11 +37,7 @@ class REPSLoss(ECPOLoss):
             (ours).
         tau: where the temperature starts, in the unit of the score. Defaults to 1.
         tau_prime: temperature of the entropy. Defaults to 0 (REPS has none).
-        entropy: see :class:`ECPOLoss`. Defaults to ``"nats"``.
-        control_variate: see :class:`ECPOLoss`. Defaults to False.
-        score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
-        delay_actor: see :class:`ECPOLoss`. Defaults to False.
-        reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
+        options: those of :class:`ECPOLoss`.
 
     Raises:
         ValueError: also for an epsilon that is not above 0, or, when called, not below log K.
@@ -68,22 +64,9 @@ class REPSLoss(ECPOLoss):
         epsilon: float = 0.5,
         tau: float = 1.0,
         tau_prime: float = 0.0,
-        entropy: Literal["nats", "matched"] = "nats",
-        control_variate: bool = False,
-        score: Score = "return",
-        delay_actor: bool = False,
-        reduction: Literal["none", "mean", "sum"] | None = None,
+        **options: Any,
     ) -> None:
-        super().__init__(
-            actor_network,
-            tau=tau,
-            tau_prime=tau_prime,
-            entropy=entropy,
-            control_variate=control_variate,
-            score=score,
-            delay_actor=delay_actor,
-            reduction=reduction,
-        )
+        super().__init__(actor_network, tau=tau, tau_prime=tau_prime, **options)
         self.epsilon = as_float("epsilon", epsilon)
         if not 0 < self.epsilon < math.inf:
             raise ValueError(f"epsilon must be above 0, in nats, got {epsilon!r}.")

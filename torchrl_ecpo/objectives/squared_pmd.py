@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from tensordict.nn import ProbabilisticTensorDictSequential
 
 from torchrl_ecpo.checks import check_choice
 from torchrl_ecpo.functional import Surrogate, squared_residual_projection
-from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, Score, TrajectoryGroups
+from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, TrajectoryGroups
 
 __all__ = ["SquaredPMDLoss"]
 
@@ -31,14 +31,9 @@ class SquaredPMDLoss(LiftProjectLoss):
         actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.
 
     Keyword Args:
-        tau: temperature of the divergence from the reference policy, in the unit of the score.
-            Defaults to 0.5, as :class:`ECPOLoss`.
-        tau_prime: temperature of the entropy. Defaults to 0 (Kimi k1.5).
         normaliser: of the target: ``"mean"`` (default, Kimi's in practice), the mean return, or
             ``"soft"``, the soft value.
-        score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
-        delay_actor: see :class:`ECPOLoss`. Defaults to False.
-        reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
+        options: those of :class:`PMDLoss`, with its defaults.
 
     Raises:
         ValueError: for an unknown `normaliser`, temperatures below 0 or both 0, and as
@@ -58,21 +53,10 @@ class SquaredPMDLoss(LiftProjectLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         *,
-        tau: float = 0.5,
-        tau_prime: float = 0.0,
         normaliser: Literal["mean", "soft"] = "mean",
-        score: Score = "return",
-        delay_actor: bool = False,
-        reduction: Literal["none", "mean", "sum"] | None = None,
+        **options: Any,
     ) -> None:
-        super().__init__(
-            actor_network,
-            tau=tau,
-            tau_prime=tau_prime,
-            score=score,
-            delay_actor=delay_actor,
-            reduction=reduction,
-        )
+        super().__init__(actor_network, **options)
         check_choice("normaliser", normaliser, ("mean", "soft"))
         self.normaliser = normaliser
 
