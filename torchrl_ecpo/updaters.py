@@ -53,7 +53,6 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
-from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule, TargetNetUpdater
 
@@ -92,7 +91,7 @@ class _NetworkUpdater(TargetNetUpdater):
         The constructor does this. Call it again after ``loss.reset_parameters_recursive()``, which
         draws different values for a network and for its delayed copy.
         """
-        for _, source, target in self._pairs():
+        for source, target in self._pairs():
             target.copy_(source)
         self.initialized = True
 
@@ -106,10 +105,10 @@ class _NetworkUpdater(TargetNetUpdater):
         if not self.initialized:
             raise RuntimeError(f"Call {type(self).__name__}.init_() before step().")
         if self._is_due():
-            for name, source, target in self._pairs():
-                self._update(name, source, target)
+            for source, target in self._pairs():
+                self._update(source, target)
 
-    def _update(self, name: str, source: Tensor, target: Tensor) -> None:
+    def _update(self, source: Tensor, target: Tensor) -> None:
         """What one call does to one delayed tensor: makes it equal to that of the network."""
         target.copy_(source)
 
@@ -134,8 +133,8 @@ class _NetworkUpdater(TargetNetUpdater):
             self.counter = check_count("counter", state_dict["counter"], least=0)
         self.initialized = initialized
 
-    def _pairs(self) -> Iterator[tuple[str, Tensor, Tensor]]:
-        """Yields the name and the data of every network tensor and its copy, buffers included."""
+    def _pairs(self) -> Iterator[tuple[Tensor, Tensor]]:
+        """Yields the data of every network tensor and of its copy, buffers included."""
         for network in self.networks:
             delayed = f"target_{network}_params"
             sources = getattr(self.loss_module, f"{network}_params")
@@ -146,8 +145,7 @@ class _NetworkUpdater(TargetNetUpdater):
                         "buffers. Use them through "
                         "`params.to_module(net, preserve_module_state=False)`."
                     )
-                path = (network, *unravel_key((key,)))
-                yield ".".join(path), sources.get(key).data, target.data
+                yield sources.get(key).data, target.data
 
     def __repr__(self) -> str:
         arguments = [type(self.loss_module).__name__, *map(repr, self.networks)]
@@ -161,8 +159,7 @@ class PeriodicCopy(_NetworkUpdater):
     This is how a reference policy moves from one lift to the next: it stands still for N gradient
     steps while the policy is projected, then becomes the policy. Calls N, 2N, 3N, ... copy, exactly
     (TorchRL's ``HardUpdate(loss, value_network_update_interval=N)`` copies on every (N+1)-th call).
-    Parameters and buffers are copied in place. There is an example at the head of
-    :mod:`torchrl_ecpo.updaters`.
+    Parameters and buffers are copied in place.
 
     Args:
         loss_module: any loss with delayed networks.
@@ -218,15 +215,11 @@ class PolyakAverage(_NetworkUpdater):
     """Moves delayed networks a fraction of the way towards the networks on every call.
 
     ``delayed <- (1 - weight) * delayed + weight * network``, in place, for parameters and floating
-    point buffers; integer and boolean buffers (a layer's batch counter) are copied. The average of
-    a network in half precision, where small steps would be rounded away, is kept in single
-    precision, as part of the state dict. There is an example at the head of
-    :mod:`torchrl_ecpo.updaters`.
+    point buffers; integer and boolean buffers (a layer's batch counter) are copied.
 
     Args:
         loss_module: any loss with delayed networks.
-        *networks: the networks to follow, by their names in the loss, such as
-            ``"qvalue_network"``. Default: all delayed networks of the loss.
+        *networks: those to follow, as in :class:`PeriodicCopy`.
 
     Keyword Args:
         weight: of the network in the average, in (0, 1]; TorchRL's ``SoftUpdate`` calls it ``tau``.
@@ -234,9 +227,9 @@ class PolyakAverage(_NetworkUpdater):
             actor-critic runs.
 
     Raises:
-        TypeError: if ``loss_module`` is no LossModule.
-        ValueError: if a network is unknown, not delayed or named twice, or if
-            ``weight`` is not in (0, 1].
+        TypeError: as :class:`PeriodicCopy`.
+        ValueError: likewise, if ``weight`` is not in (0, 1], and for networks in half precision,
+            where small steps would be rounded away.
 
     Examples:
         >>> from torchrl_ecpo import ECPOLoss
@@ -254,53 +247,23 @@ class PolyakAverage(_NetworkUpdater):
         self.weight = as_float("weight", weight)
         if not 0 < self.weight <= 1:
             raise ValueError(f"weight must be in (0, 1], got {weight!r}.")
-        self._averages: dict[str, Tensor] = {}
         super().__init__(loss_module, *networks)
 
-    def init_(self) -> None:
-        """Copies the networks into their delayed parameters, now; averages begin there."""
-        super().init_()
-        self._averages.clear()
+    def _pairs(self) -> Iterator[tuple[Tensor, Tensor]]:
+        for source, target in super()._pairs():
+            if target.is_floating_point() and target.dtype.itemsize < torch.float32.itemsize:
+                raise ValueError(
+                    f"PolyakAverage follows networks in single precision at least, got "
+                    f"{target.dtype}, in which small steps are rounded away: keep the loss in "
+                    "torch.float32, and compute under torch.autocast."
+                )
+            yield source, target
 
-    def _update(self, name: str, source: Tensor, target: Tensor) -> None:
-        if not target.is_floating_point():
-            target.copy_(source)
-        elif _is_half(target):
-            self._averages[name] = self._average(name, target).lerp(source.float(), self.weight)
-            target.copy_(self._averages[name])
-        else:
+    def _update(self, source: Tensor, target: Tensor) -> None:
+        if target.is_floating_point():
             target.lerp_(source, self.weight)
-
-    def _average(self, name: str, target: Tensor) -> Tensor:
-        """In single precision; anew from the delayed tensor where somebody else has written it."""
-        average = self._averages.get(name)
-        if average is None:
-            return target.float()
-        average = average.to(target.device)
-        return average.where(average.to(target.dtype) == target, target.float())
-
-    def state_dict(self) -> dict[str, Any]:
-        """Returns the progress: of networks in half precision, their averages in single."""
-        pairs = [(name, target) for name, _, target in self._pairs() if _is_half(target)]
-        averages = {name: self._average(name, target) for name, target in pairs}
-        return super().state_dict() | ({"averages": averages} if averages else {})
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restores what :meth:`state_dict` returned.
-
-        Raises:
-            ValueError: if it is not the state of an updater of this kind and of these networks.
-        """
-        own, given = self.state_dict().get("averages", {}), state_dict.get("averages", {})
-        super().load_state_dict(state_dict)
-        check_kind("averages", given, Mapping)
-        wrong = [n for n in own | given if n not in own or not _is_like(given.get(n), own[n])]
-        if wrong:
-            raise ValueError(
-                f"The averages of {wrong} in the state are missing, not this updater's, or no "
-                "finite single-precision numbers of its shapes: was it saved with other networks?"
-            )
-        self._averages = {name: average.detach().clone() for name, average in given.items()}
+        else:
+            target.copy_(source)
 
 
 class UpdaterSequence(TargetNetUpdater):
@@ -308,7 +271,7 @@ class UpdaterSequence(TargetNetUpdater):
 
     It is a :class:`~torchrl.objectives.TargetNetUpdater` itself, so it goes wherever TorchRL takes
     one (a trainer's ``target_net_updater``, :class:`~torchrl.trainers.TargetNetUpdaterHook`), and
-    into another sequence. There is an example at the head of :mod:`torchrl_ecpo.updaters`.
+    into another sequence.
 
     Args:
         *updaters: updaters of one and the same loss, no two of which update the same network.
@@ -383,17 +346,6 @@ class UpdaterSequence(TargetNetUpdater):
     def __repr__(self) -> str:
         lines = "".join(f"    {updater!r},\n" for updater in self.updaters)
         return f"{type(self).__name__}(\n{lines})"
-
-
-def _is_like(given: Any, own: Tensor) -> bool:
-    """Whether it is a finite tensor of the same kind."""
-    is_like = isinstance(given, Tensor) and (given.shape, given.dtype) == (own.shape, own.dtype)
-    return is_like and bool(given.isfinite().all())
-
-
-def _is_half(tensor: Tensor) -> bool:
-    """Whether it has floating point numbers of less than single precision."""
-    return tensor.is_floating_point() and tensor.dtype.itemsize < torch.float32.itemsize
 
 
 def _delayed_networks(loss_module: LossModule, networks: tuple[str, ...] = ()) -> tuple[str, ...]:

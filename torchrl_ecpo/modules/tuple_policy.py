@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from copy import copy
 from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torch.distributions import Distribution, constraints
 from torch.distributions.utils import lazy_property
 from torch.nn import functional as F
 from torchrl.envs import ExplorationType, exploration_type
-from torchrl.modules import LSTMModule, ProbabilisticActor
+from torchrl.modules import ProbabilisticActor
 
 from torchrl_ecpo.checks import check_count, check_counts, check_flag, check_kind, described
-from torchrl_ecpo.modules.distinct import DistinctCore, Evaluated, take_rows
+from torchrl_ecpo.modules.distinct import Evaluated, take_rows
 from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
 from torchrl_ecpo.modules.windows import DistinctWindowNetwork, OneHotLinear
 
@@ -294,8 +293,6 @@ class TupleTables(nn.Module):
             previous action's parts, each with one more for none.
         window: how many steps are seen, at least 2.
         hidden_size: of the hidden layer (ReLU).
-        device: of the parameters.
-        dtype: of the parameters.
 
     Raises:
         TypeError: if `num_classes` is no sequence.
@@ -318,22 +315,19 @@ class TupleTables(nn.Module):
         num_classes: Sequence[int],
         window: int,
         hidden_size: int = 64,
-        device: torch.device | str | None = None,
-        dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
         self.window = check_count("window", window, least=2)
-        factory: dict[str, Any] = {"device": device, "dtype": dtype}
         observations, moves, _, characters = self.num_classes = check_counts(
             "num_classes", num_classes
         )
         self.num_moves, self.num_characters = moves - 1, characters - 1
         num_logits = self.num_moves + 2 + self.num_characters
-        self.hidden = OneHotLinear(self.num_classes, hidden_size, **factory)
-        self.readout = nn.Linear(hidden_size, num_logits, **factory)
+        self.hidden = OneHotLinear(self.num_classes, hidden_size)
+        self.readout = nn.Linear(hidden_size, num_logits)
         num_rows = (observations + 1) ** window * characters
-        self.characters = nn.Parameter(torch.zeros(num_rows, self.num_characters, **factory))
-        self.moves = nn.Parameter(torch.zeros((moves + 1) ** 2, self.num_moves, **factory))
+        self.characters = nn.Parameter(torch.zeros(num_rows, self.num_characters))
+        self.moves = nn.Parameter(torch.zeros((moves + 1) ** 2, self.num_moves))
 
     def forward(self, classes: Tensor) -> Tensor:
         """The logits of windows.
@@ -371,14 +365,11 @@ def make_tuple_policy(
     hidden_size: int = 128,
     window: int | None = None,
     tables: bool = False,
-    distinct_histories: bool = True,
-    device: torch.device | str | None = None,
-    dtype: torch.dtype | None = None,
 ) -> ProbabilisticActor:
     """Build the policy of the algorithmic tasks.
 
-    One-hot observation and previous action, an LSTM or a window of the last steps with a hidden
-    layer (ReLU), a linear head, :class:`TupleCategorical`. It
+    One-hot observation and previous action, an LSTM (:class:`DistinctHistoryLSTM`) or a window of
+    the last steps with a hidden layer (ReLU), a linear head, :class:`TupleCategorical`. It
     reads `observation` (int64 `[*B]`, below `num_observations`), `previous_action` (int64 `[*B,
     3]`, below nvec + 1: the last class of each means that there is none yet) and `is_init` (of
     `torchrl.envs.InitTracker`), and writes `logits`, `action` (int64 `[*B, 3]`) and
@@ -392,11 +383,6 @@ def make_tuple_policy(
             (:class:`DistinctWindowNetwork`). Default None: the LSTM.
         tables: whether tables read what lies before the present step (:class:`TupleTables`).
             Default False: the hidden layer does.
-        distinct_histories: whether rows with equal histories are computed once
-            (:class:`DistinctHistoryLSTM`), or each row by :class:`torchrl.modules.LSTMModule`. The
-            numbers and the order of the parameters are the same.
-        device: of the parameters.
-        dtype: of the parameters.
 
     Returns:
         The actor. Its environment needs `InitTracker()` and, to sample, the state's primer. Both
@@ -430,34 +416,19 @@ def make_tuple_policy(
     nvec = check_counts("nvec", nvec)
     num_classes = [num_observations, *(n + 1 for n in nvec)]
     inputs: list[NestedKey] = ["observation", "previous_action"]
-    factory: dict[str, Any] = {"device": device, "dtype": dtype}
+    keys: dict[str, Any] = {"in_keys": inputs, "out_key": "logits"}
     core: Any
-    readout = nn.Linear(hidden_size, _num_logits(nvec), **factory)
-    if window is not None:
+    readout = nn.Linear(hidden_size, _num_logits(nvec))
+    if window is None:
+        core = DistinctHistoryLSTM(num_classes, hidden_size, readout, **keys)
+    else:
         network: nn.Module
         if check_flag("tables", tables):
-            network = TupleTables(num_classes, window, hidden_size, **factory)
+            network = TupleTables(num_classes, window, hidden_size)
         else:
             sizes = num_classes * check_count("window", window)
-            network = nn.Sequential(OneHotLinear(sizes, hidden_size, **factory), nn.ReLU(), readout)
-        core = DistinctWindowNetwork(num_classes, network, window, in_keys=inputs, out_key="logits")
-    elif check_flag("distinct_histories", distinct_histories):
-        core = DistinctHistoryLSTM(
-            num_classes,
-            hidden_size,
-            readout=readout,
-            in_keys=inputs,
-            out_key="logits",
-            **factory,
-        )
-    else:
-        lstm = nn.LSTM(sum(num_classes), hidden_size, batch_first=True, **factory)
-        modules: list[Any] = [
-            TensorDictModule(_OneHot(num_classes, dtype), in_keys=inputs, out_keys=["one_hot"]),
-            LSTMModule(lstm=lstm, in_key="one_hot", out_key="embed"),
-            TensorDictModule(readout, in_keys=["embed"], out_keys=["logits"]),
-        ]
-        core = TensorDictSequential(*modules)
+            network = nn.Sequential(OneHotLinear(sizes, hidden_size), nn.ReLU(), readout)
+        core = DistinctWindowNetwork(num_classes, network, window, **keys)
     return _TupleActor(
         core,
         in_keys=["logits"],
@@ -470,7 +441,7 @@ def make_tuple_policy(
 
 
 class TuplePolicy:
-    """What policies over a :class:`DistinctCore` share: distributions of each distinct past."""
+    """What policies over a ``DistinctCore`` share: distributions of each distinct past."""
 
     _known: TupleCategorical | None = None
 
@@ -483,7 +454,7 @@ class TuplePolicy:
     def constant_weights(self) -> Iterator[None]:
         """Within, the weights do not change: what depends on them alone is computed once."""
         core, options = self.parts
-        with core.constant_weights() if isinstance(core, DistinctCore) else nullcontext() as logits:
+        with core.constant_weights() as logits:
             if logits is not None:
                 self._known = TupleCategorical(logits, **options)
             try:
@@ -519,7 +490,7 @@ class _TupleActor(TuplePolicy, ProbabilisticActor):
 
     def get_dist(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> Any:
         """The distribution of the actions; see the base class."""
-        if args or kwargs or not isinstance(self.parts[0], DistinctCore):
+        if args or kwargs:
             return super().get_dist(tensordict, *args, **kwargs)
         return self.read(tensordict)[0]
 
@@ -529,7 +500,6 @@ class _TupleActor(TuplePolicy, ProbabilisticActor):
         core, head = modules
         kind = exploration_type() or head.default_interaction_type
         usual = len(args) == 1 and isinstance(args[0], TensorDictBase) and not kwargs
-        usual = usual and isinstance(core, DistinctCore)
         selected = self.out_keys != self.all_out_keys
         if not usual or kind is not ExplorationType.RANDOM or selected:
             return super().forward(*args, **kwargs)
@@ -537,23 +507,3 @@ class _TupleActor(TuplePolicy, ProbabilisticActor):
         action, log_prob = distribution.sample_and_log_prob()
         tensordict = core.write(args[0], read)
         return tensordict.set("action", action).set("action_log_prob", log_prob)
-
-
-class _OneHot(nn.Module):
-    """One-hot vectors of the inputs, concatenated.
-
-    Args:
-        num_classes: the number of classes of the observation and of each part of the action.
-        dtype: of the vectors. Default None: PyTorch's default.
-    """
-
-    def __init__(self, num_classes: Sequence[int], dtype: torch.dtype | None = None) -> None:
-        super().__init__()
-        self.num_classes = tuple(num_classes)
-        self.dtype = dtype or torch.get_default_dtype()
-
-    def forward(self, observation: Tensor, previous_action: Tensor) -> Tensor:
-        """Encode observations `[*B]` and actions `[*B, d]`: `[*B, sum(num_classes)]`."""
-        columns = [observation, *previous_action.unbind(-1)]
-        hots = [F.one_hot(x, n) for x, n in zip(columns, self.num_classes, strict=True)]
-        return torch.cat(hots, -1).to(self.dtype)

@@ -168,8 +168,6 @@ class OneHotLinear(nn.Linear):
     Args:
         num_classes: the number of classes of each integer.
         out_features: H.
-        device: of the parameters.
-        dtype: of the parameters.
 
     Raises:
         TypeError: if `num_classes` is no sequence.
@@ -185,16 +183,9 @@ class OneHotLinear(nn.Linear):
 
     offsets: Tensor
 
-    def __init__(
-        self,
-        num_classes: Sequence[int],
-        out_features: int,
-        device: torch.device | str | None = None,
-        dtype: torch.dtype | None = None,
-    ) -> None:
-        sizes = check_counts("num_classes", num_classes)
-        super().__init__(sum(sizes), out_features, device=device, dtype=dtype)
-        sizes = torch.tensor(sizes, device=device)
+    def __init__(self, num_classes: Sequence[int], out_features: int) -> None:
+        sizes = torch.tensor(check_counts("num_classes", num_classes))
+        super().__init__(int(sizes.sum()), out_features)
         self.register_buffer("offsets", sizes.cumsum(0) - sizes, persistent=False)
 
     def forward(self, classes: Tensor) -> Tensor:

@@ -24,14 +24,11 @@ class MENTLoss(TrajectoryGroupLoss):
         L(\theta) = -\frac1K \sum_k (S_k - \bar S) \log \pi_\theta(\rho_k), \quad
         S_k = r_k - \tau \log \pi_\theta(\rho_k)
 
-    Args:
-        actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.
+    The actor and what is not described here are as in :class:`TrajectoryGroupLoss`.
 
     Keyword Args:
         tau: temperature of the entropy, in the unit of the score; 0 is plain REINFORCE. Defaults
             to 0.01, the UREX paper's setting for this baseline.
-        score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
-        reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
     Raises:
         ValueError: for a `tau` below 0, and as :class:`TrajectoryGroupLoss`.

@@ -22,16 +22,12 @@ class PMDLoss(LiftProjectLoss):
     ``tau_prime > 0`` the paper's PMD+entropy. At pi = pi_bar it is REINFORCE with the group's mean
     as baseline.
 
-    Args:
-        actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.
+    The actor and what is not described here are as in :class:`TrajectoryGroupLoss`.
 
     Keyword Args:
         tau: temperature of the divergence from the reference policy, in the unit of the score.
             Defaults to 0.5, as :class:`ECPOLoss`.
         tau_prime: temperature of the entropy. Defaults to 0 (the paper's PMD).
-        score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
-        delay_actor: see :class:`ECPOLoss`. Defaults to False.
-        reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
     Raises:
         ValueError: for temperatures below 0 or both 0, and as :class:`TrajectoryGroupLoss`.

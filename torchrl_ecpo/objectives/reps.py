@@ -29,15 +29,13 @@ class REPSLoss(ECPOLoss):
     in the mean over the groups: ``loss_tau`` is a loss of the parameter ``log_tau`` alone, with the
     gradient g'. Add it to ``loss_actor``.
 
-    Args:
-        actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.
+    The actor and what is not described here are as in :class:`ECPOLoss`.
 
     Keyword Args:
         epsilon: how far the lift goes, in nats; above 0, and below log K. Defaults to 0.5
             (ours).
         tau: where the temperature starts, in the unit of the score. Defaults to 1.
         tau_prime: temperature of the entropy. Defaults to 0 (REPS has none).
-        options: those of :class:`ECPOLoss`.
 
     Raises:
         ValueError: also for an epsilon that is not above 0, or, when called, not below log K.

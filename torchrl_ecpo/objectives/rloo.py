@@ -29,14 +29,11 @@ class RLOOLoss(MENTLoss):
         L(\theta) = -\frac1K \sum_k \left(S_k - \frac1{K-1} \sum_{j \ne k} S_j\right)
             \log \pi_\theta(\rho_k), \quad S_k = r_k - \tau \log \pi_\theta(\rho_k)
 
-    Args:
-        actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.
+    The actor and what is not described here are as in :class:`TrajectoryGroupLoss`.
 
     Keyword Args:
         tau: temperature of the entropy, in the unit of the score. Defaults to 0 (RLOO as
             published).
-        score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
-        reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
     Raises:
         ValueError: for a `tau` below 0, and as :class:`TrajectoryGroupLoss`.

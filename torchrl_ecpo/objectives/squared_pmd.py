@@ -27,13 +27,11 @@ class SquaredPMDLoss(LiftProjectLoss):
 
     and with ``tau_prime > 0`` for :class:`ECPOLoss`'s target. Kimi's own is 2 tau times that.
 
-    Args:
-        actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.
+    The actor and what is not described here are as in :class:`PMDLoss`.
 
     Keyword Args:
         normaliser: of the target: ``"mean"`` (default, Kimi's in practice), the mean return, or
             ``"soft"``, the soft value.
-        options: those of :class:`PMDLoss`, with its defaults.
 
     Raises:
         ValueError: for an unknown `normaliser`, temperatures below 0 or both 0, and as
