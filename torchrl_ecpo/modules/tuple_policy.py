@@ -123,28 +123,14 @@ class TupleCategorical(Distribution):
         return other
 
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
-        """Draw actions, each part by inverting its distribution function.
-
-        Args:
-            sample_shape: the shape of the sample, before the batch shape.
-
-        Returns:
-            int64 `[*sample_shape, *B, 3]`.
-        """
+        """Draw int64 actions `[*sample_shape, *B, 3]`, each part by inverting its distribution."""
         # Numbers of half precision are so coarse that 0 is among a few hundred.
         dtype = torch.promote_types(self._table.dtype, torch.float32)
         shape = (*sample_shape, *self.batch_shape, 3)
         return self.choose(torch.rand(shape, dtype=dtype, device=self._table.device))
 
     def choose(self, uniform: Tensor) -> Tensor:
-        """Draw actions with given randomness.
-
-        Args:
-            uniform: drawn uniformly from [0, 1), `[*sample_shape, *B, 3]`.
-
-        Returns:
-            int64 `[*sample_shape, *B, 3]`.
-        """
+        """Draw int64 actions with given numbers from [0, 1), both `[*sample_shape, *B, 3]`."""
         bounds = self._of_rows(self._bounds).to(uniform.dtype)
         bounds = bounds.expand(*uniform.shape, -1).contiguous()
         choice = torch.searchsorted(bounds, uniform.unsqueeze(-1), right=True).squeeze(-1)
@@ -152,14 +138,7 @@ class TupleCategorical(Distribution):
         return choice
 
     def sample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
-        """Draw actions and give their log-probabilities; there is no need to check their range.
-
-        Args:
-            sample_shape: the shape of the sample, before the batch shape.
-
-        Returns:
-            int64 `[*sample_shape, *B, 3]` and `[*sample_shape, *B]`.
-        """
+        """Draw actions `[*sample_shape, *B, 3]`, with log-probabilities `[*sample_shape, *B]`."""
         action = self.sample(sample_shape)
         return action, self._score(action)
 
@@ -175,13 +154,7 @@ class TupleCategorical(Distribution):
     deterministic_sample = mode  # which `ExplorationType.DETERMINISTIC` asks for
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log-probability of actions.
-
-        Args:
-            value: int64 `[..., 3]`, broadcast against the batch shape.
-
-        Returns:
-            `[...]`.
+        """Log-probability `[...]` of int64 actions `[..., 3]`, broadcast against the batch shape.
 
         Raises:
             ValueError: if an action is out of range.
@@ -330,14 +303,7 @@ class TupleTables(nn.Module):
         self.moves = nn.Parameter(torch.zeros((moves + 1) ** 2, self.num_moves))
 
     def forward(self, classes: Tensor) -> Tensor:
-        """The logits of windows.
-
-        Args:
-            classes: int64 `[n, window, 4]`, the present step first; -1 where there is none.
-
-        Returns:
-            `[n, L]`.
-        """
+        """Logits `[n, L]` of int64 windows `[n, window, 4]`, the present step first, -1: none."""
         observation, move, write, character = classes.unbind(-1)
         blank, moves = self.num_classes[0] - 1, self.num_classes[1]
         logits = self.readout(self.hidden(classes[:, 0]).relu())

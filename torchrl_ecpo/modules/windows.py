@@ -189,15 +189,7 @@ class OneHotLinear(nn.Linear):
         self.register_buffer("offsets", sizes.cumsum(0) - sizes, persistent=False)
 
     def forward(self, classes: Tensor) -> Tensor:
-        """Apply it.
-
-        Args:
-            classes: int64 `[n, *]`, as many a row as there are in `num_classes`; -1 has the zero
-                vector.
-
-        Returns:
-            `[n, H]`.
-        """
+        """From int64 `[n, *]`, one of each of `num_classes`, to `[n, H]`; -1 is the zero vector."""
         classes = classes.flatten(1)
         hot = (classes + self.offsets).where(classes >= 0, self.in_features)
         columns = F.pad(self.weight.t(), (0, 0, 0, 1))  # the last one is of -1
