@@ -100,7 +100,7 @@ class DistinctCore(TensorDictModuleBase):
         yield None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the output into `[*B]`, in recurrent mode `[*B, T]`; in sampling next states too."""
+        """Write the output into `[*B]`, or `[*B, T]` in recurrent mode; in sampling next states."""
         return self.write(tensordict, self.read(tensordict))
 
     def write(self, tensordict: TensorDictBase, found: Evaluated) -> TensorDictBase:
