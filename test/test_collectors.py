@@ -548,7 +548,7 @@ class Stranger(Countdown):
         ({"init_random_frames": 10}, TypeError, "every action comes from the policy"),
         ({"split_trajs": True}, TypeError, "does not take split_trajs"),
         ({"sync": True}, ValueError, "sync needs num_collectors"),
-        ({"backend": "rpc"}, ValueError, "backend='rpc'.*'process' and 'ray'"),
+        ({"backend": "rpc"}, ValueError, "backend must be one of .*'process', 'ray'.*got 'rpc'"),
         ({"backend_options": {}}, ValueError, "backend_options are for backend='ray'"),
         ({"num_collectors": 2, "num_groups": 3, "sync": True}, ValueError, "number of workers, 2"),
         (

@@ -16,7 +16,7 @@ from torch import nn
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
-from torchrl_ecpo.checks import check_count, check_flag, check_group_size
+from torchrl_ecpo.checks import check_choice, check_count, check_flag, check_group_size
 from torchrl_ecpo.collectors._base import PlayerCollector, check_makers
 from torchrl_ecpo.collectors.rollout import GroupPlayer
 from torchrl_ecpo.collectors.workers import Workers
@@ -194,10 +194,7 @@ def _find_makers(
     has_workers = several or num_collectors is not None
     if backend is None:
         backend = "process" if has_workers else "direct"
-    if backend not in ("direct", "process", "ray"):
-        raise ValueError(
-            f"backend={backend!r} does not collect groups; 'direct', 'process' and 'ray' do."
-        )
+    check_choice("backend", backend, ("direct", "process", "ray"))
     if backend == "direct" and (has_workers or sync is not None):
         raise ValueError(
             "sync, num_collectors and lists of environment makers are for workers: sync needs "

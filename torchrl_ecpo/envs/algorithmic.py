@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torchrl.data import Categorical, Composite, MultiCategorical, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_ecpo.checks import check_count, check_kind, described, get_entry
+from torchrl_ecpo.checks import check_choice, check_count, check_kind, described, get_entry
 from torchrl_ecpo.envs._groups import GroupIdAllocator, check_owner
 
 __all__ = ["TASKS", "AlgorithmicEnv", "AlgorithmicTask"]
@@ -411,10 +411,7 @@ class AlgorithmicEnv(EnvBase):
                 f"min_length of {self.task_name} must lie in {lowest}..{_TOP_LEVEL}, "
                 f"got {min_length}."
             )
-        if curriculum not in ("group", "batch", "gym", None):
-            raise ValueError(
-                f"curriculum must be 'group', 'batch', 'gym' or None, got {curriculum!r}."
-            )
+        check_choice("curriculum", curriculum, ("group", "batch", "gym", None))
 
     def get_extra_state(self) -> dict[str, str]:
         """Which environment the state is of."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
@@ -85,7 +85,7 @@ class RLOOLoss(MENTLoss):
         L(\theta) = -\frac1K \sum_k \left(S_k - \frac1{K-1} \sum_{j \ne k} S_j\right)
             \log \pi_\theta(\rho_k), \quad S_k = r_k - \tau \log \pi_\theta(\rho_k)
 
-    The actor and what is not described here are as in :class:`TrajectoryGroupLoss`.
+    The actor and what is not described here are as in :class:`MENTLoss`.
 
     Keyword Args:
         tau: temperature of the entropy, in the unit of the score. Defaults to 0 (RLOO as
@@ -108,10 +108,9 @@ class RLOOLoss(MENTLoss):
         actor_network: ProbabilisticTensorDictSequential,
         *,
         tau: float = 0.0,
-        score: Score = "return",
-        reduction: Literal["none", "mean", "sum"] | None = None,
+        **options: Any,
     ) -> None:
-        super().__init__(actor_network, tau=tau, score=score, reduction=reduction)
+        super().__init__(actor_network, tau=tau, **options)
 
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
         """REINFORCE on the score less tau log pi, against the others."""
