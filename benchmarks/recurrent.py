@@ -14,18 +14,49 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from csv_table import add_csv_option, write_csv
 from tensordict import TensorDict
-from torchrl.modules import ProbabilisticActor, set_recurrent_mode
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torchrl.envs import ExplorationType
+from torchrl.modules import LSTMModule, ProbabilisticActor, set_recurrent_mode
 
-from torchrl_ecpo.modules import make_tuple_policy
+from torchrl_ecpo.modules import TupleCategorical, make_tuple_policy
 
 NVEC = (2, 2, 5)
 NUM_OBSERVATIONS = 6
 STATES = ("recurrent_state_h", "recurrent_state_c")
+
+
+def make_plain_policy(
+    num_observations: int, nvec: Sequence[int], hidden_size: int
+) -> ProbabilisticActor:
+    """The policy of `make_tuple_policy` with TorchRL's LSTMModule."""
+    sizes = [num_observations, *(n + 1 for n in nvec)]
+
+    def one_hot(observation: Tensor, action: Tensor) -> Tensor:
+        columns = zip((observation, *action.unbind(-1)), sizes, strict=True)
+        return torch.cat([F.one_hot(x, n) for x, n in columns], -1).float()
+
+    lstm = nn.LSTM(sum(sizes), hidden_size, batch_first=True)
+    parts: list[Any] = [
+        TensorDictModule(one_hot, ["observation", "previous_action"], ["one_hot"]),
+        LSTMModule(lstm=lstm, in_key="one_hot", out_key="embed"),
+        TensorDictModule(nn.Linear(hidden_size, sum(nvec)), ["embed"], ["logits"]),
+    ]
+    return ProbabilisticActor(
+        TensorDictSequential(*parts),
+        in_keys=["logits"],
+        distribution_class=TupleCategorical,
+        distribution_kwargs={"nvec": nvec},
+        default_interaction_type=ExplorationType.RANDOM,
+        return_log_prob=True,
+    )
 
 
 def make_histories(groups: int, rollouts: int, steps: int, branch: float) -> TensorDict:
@@ -100,13 +131,8 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     policies = [
-        make_tuple_policy(
-            NUM_OBSERVATIONS,
-            NVEC,
-            hidden_size=arguments.hidden_size,
-            distinct_histories=distinct,
-        )
-        for distinct in (False, True)
+        make(NUM_OBSERVATIONS, NVEC, hidden_size=arguments.hidden_size)
+        for make in (make_plain_policy, make_tuple_policy)
     ]
     for plain, distinct in zip(*(policy.parameters() for policy in policies), strict=True):
         distinct.data.copy_(plain)

@@ -360,16 +360,12 @@ def test_a_batch_is_sampled_from_the_reference():
     collector.shutdown()
 
 
-@pytest.mark.parametrize("by_factory", [False, True])
-def test_the_training_mode_is_the_policys(by_factory):
-    """At each batch, of each of its modules; a factory's policy follows whose weights it has."""
+def test_the_training_mode_is_the_policys():
+    """At each batch, of each of its modules."""
     policy = moded_policy()
-    made = {"policy_factory": moded_policy} if by_factory else {"policy": policy}
-    collector = TrajectoryGroupCollector(Countdown(), num_groups=2, group_size=3, **made)
+    collector = TrajectoryGroupCollector(Countdown(), policy, num_groups=2, group_size=3)
     for training in (True, False, True):
         policy.module.train(training)
-        if by_factory:
-            collector.update_policy_weights_(policy)
         batch = collector.rollout()
         assert (batch["training"][batch["collector", "mask"]] == training).all()
     collector.shutdown()
@@ -413,9 +409,7 @@ def test_an_update_within_a_batch_counts_from_the_next_one(update_at):
 
 
 def test_ways_to_give_weights():
-    collector = TrajectoryGroupCollector(
-        Countdown(), policy_factory=linear_policy, num_groups=2, group_size=3
-    )
+    collector = TrajectoryGroupCollector(Countdown(), linear_policy(), num_groups=2, group_size=3)
     batches = iter(collector)
     others = [linear_policy(weight) for weight in (1.0, 2.0, 3.0)]
     weights = [TensorDict.from_module(other).data for other in others]
@@ -428,8 +422,6 @@ def test_ways_to_give_weights():
     for wrong in ({"policy_or_weights": others[0], **given[2]}, {"weights_dict": {"critic": 0}}):
         with pytest.raises(ValueError, match="weights of one policy"):
             collector.update_policy_weights_(**wrong)
-    with pytest.raises(ValueError, match="policy_factory"):
-        collector.update_policy_weights_()
     random = TrajectoryGroupCollector(Countdown(), num_groups=2, group_size=3)
     random.update_policy_weights_()  # as trainers do
 
@@ -556,7 +548,7 @@ class Stranger(Countdown):
         ({"init_random_frames": 10}, TypeError, "every action comes from the policy"),
         ({"split_trajs": True}, TypeError, "does not take split_trajs"),
         ({"sync": True}, ValueError, "sync needs num_collectors"),
-        ({"backend": "rpc"}, ValueError, "backend='rpc'.*'process' and 'ray'"),
+        ({"backend": "rpc"}, ValueError, "backend must be one of .*'process', 'ray'.*got 'rpc'"),
         ({"backend_options": {}}, ValueError, "backend_options are for backend='ray'"),
         ({"num_collectors": 2, "num_groups": 3, "sync": True}, ValueError, "number of workers, 2"),
         (
@@ -565,7 +557,7 @@ class Stranger(Countdown):
             "the 1 environment",
         ),
         ({"num_collectors": 1, "create_env_fn": Countdown()}, TypeError, "got an EnvBase"),
-        ({"policy_factory": linear_policy}, TypeError, "policy must be None"),
+        ({"policy_factory": linear_policy}, TypeError, "does not take policy_factory"),
         ({"nonsense": 1}, TypeError, "nonsense"),
     ],
 )
@@ -578,7 +570,7 @@ def test_bad_arguments(options, error, match):
 @pytest.mark.parametrize(
     ("env", "error", "match"),
     [
-        (lambda: Countdown(longest=50), RuntimeError, "max_steps=20.*StepCounter.*max_frames_per"),
+        (lambda: Countdown(longest=50), RuntimeError, "max_steps=20.*append StepCounter"),
         (lambda: Stranger(lambda g: g + torch.arange(3)), ValueError, "equal for the group_size=3"),
         (lambda: Stranger(lambda g: g * 0), ValueError, "different from those of the others"),
     ],
@@ -586,13 +578,6 @@ def test_bad_arguments(options, error, match):
 def test_bad_environments(env, error, match):
     with pytest.raises(error, match=match):
         collect(env(), num_groups=20, max_steps=20)
-
-
-def test_max_frames_per_traj():
-    batch = collect(Countdown(shortest=9, longest=50), max_frames_per_traj=5)
-    assert batch.shape[-1] == 5
-    assert batch["collector", "mask"].all()
-    assert batch["next", "truncated"][..., -1, 0].all()
 
 
 # Workers do not find this module: what they need of it travels by value.

@@ -248,7 +248,7 @@ class TestSampler:
     def test_draws_are_uniform_and_independent(self, what):
         """Ordered pairs of 4 groups, or of 4 members: each pair follows each equally often."""
         groups = what == "groups"
-        buffer = make_buffer(seed=1, num_groups=2 if groups else 1)
+        buffer = make_buffer(seed=1)
         buffer.extend(make_steps([(i // 2, 1) for i in range(8)] if groups else [(7, 1)] * 4))
         size = 4 if groups else 2
         draws = [buffer.sampler.sample(buffer.storage, size)[0].flatten() for _ in range(6000)]
@@ -448,7 +448,7 @@ class TestSampler:
         assert {len(buffer.sample()[MASK][0, 0]) for _ in range(30)} == {2, 3}
 
     def test_nothing_to_draw(self):
-        buffer = make_buffer(num_groups=2, replacement=False)
+        buffer = make_buffer(replacement=False)
         buffer.extend(make_steps(TRAJECTORIES))
         buffer.empty()
         with pytest.raises(RuntimeError, match=r"2 group\(s\) of 2.*0 complete"):
@@ -490,7 +490,6 @@ class TestSampler:
         [
             ({"group_size": 1}, ValueError, "group_size must be an integer of at least 2.*got 1"),
             ({"batch_size": 5}, ValueError, r"num_groups \* group_size=2, got 5"),
-            ({"num_groups": 3}, ValueError, r"num_groups=3 \* group_size=2, got 4"),
             ({"group_key": "instance"}, KeyError, "'instance' is missing.*problem instance"),
             ({"done_key": ("next", "end")}, KeyError, "end.*where a trajectory ends"),
             ({"storage": ListStorage}, TypeError, "LazyTensorStorage.*got ListStorage"),

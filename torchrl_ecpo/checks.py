@@ -18,7 +18,7 @@ from torch import Tensor
 from torchrl_ecpo._torch import is_transformed
 
 
-def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
+def check_choice(name: str, value: Any, choices: Sequence[Any]) -> None:
     """Refuse what is not among the choices of an option."""
     if value not in choices:
         raise ValueError(f"{name} must be one of {choices}, got {value!r}.")

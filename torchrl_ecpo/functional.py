@@ -81,7 +81,6 @@ __all__ = [
     "standardised",
     "standardised_in_batch",
     "surrogate_reward",
-    "surrogate_reward_estimate",
     "temperature_dual",
     "theorem1_temperatures",
     "uniform_weights",
@@ -1063,7 +1062,8 @@ def surrogate_reward(
             \exp \frac{r(\rho) + \tau \log \pi(\rho)}{\tau + \tau'}
 
     It is the :func:`soft_value` of the problem whose actions are whole trajectories, with pi as the
-    reference: from E r + tau' H(pi) (tau to infinity) to max r (both to zero), Lemma 2.
+    reference: from E r + tau' H(pi) (tau to infinity) to max r (both to zero), Lemma 2. From K
+    trajectories of pi it is estimated by :func:`soft_value_estimate`.
 
     Examples:
         >>> log_prob, score = torch.tensor([0.5, 0.5]).log(), torch.tensor([1.0, 0.0])
@@ -1071,28 +1071,6 @@ def surrogate_reward(
         tensor(0.9993)
     """
     return soft_value(
-        score, log_prob, tau=tau, tau_prime=tau_prime, sample_dim=sample_dim, mask=mask
-    )
-
-
-def surrogate_reward_estimate(
-    score: Tensor,
-    log_prob: Tensor,
-    *,
-    tau: float | Tensor,
-    tau_prime: float | Tensor,
-    sample_dim: int = -1,
-    mask: Tensor | None = None,
-) -> Tensor:
-    """The surrogate reward SR (Eq. 7) from K trajectories of pi: :func:`soft_value_estimate`.
-
-    Examples:
-        >>> log_prob, score = torch.tensor([0.5, 0.5]).log(), torch.tensor([1.0, 1.0])
-        >>> sr = surrogate_reward_estimate(score, log_prob, tau=0.5, tau_prime=0.25)
-        >>> (sr - 1) / math.log(2)
-        tensor(0.2500)
-    """
-    return soft_value_estimate(
         score, log_prob, tau=tau, tau_prime=tau_prime, sample_dim=sample_dim, mask=mask
     )
 

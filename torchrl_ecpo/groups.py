@@ -19,7 +19,6 @@ from torchrl.data.replay_buffers.samplers import Sampler
 
 from torchrl_ecpo._torchrl import buffers_of, generator_of
 from torchrl_ecpo.checks import (
-    check_count,
     check_flag,
     check_group_size,
     check_mask,
@@ -345,7 +344,8 @@ _NOTHING = _Whole(_NONE, _NONE, _NONE, _NONE, _NONE, waiting=0, torn=0, num_slot
 class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
     """Draws complete groups of whole trajectories from a flat replay buffer, as `[G, K, T]`.
 
-    A batch has `G` distinct groups, uniformly drawn, and `K` distinct trajectories of each. Groups
+    A batch has `G` = batch size / `K` distinct groups, uniformly drawn, and `K` distinct
+    trajectories of each. Groups
     with fewer than `K` trajectories wait; of larger ones `K` are drawn. Group ids must be unique
     within the storage: trajectories that share one are drawn as one group.
 
@@ -368,7 +368,6 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
 
     Args:
         group_size: `K`, the number of trajectories drawn from a group, at least 2.
-        num_groups: `G`. Default: batch size / `K`.
         replacement: if True (default), each batch is drawn from all complete groups. If False, no
             group is drawn twice in a pass; a pass ends, and ``ran_out`` is set, when fewer than
             `G` groups are left. Groups that are completed on the way join it.
@@ -413,7 +412,6 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
         self,
         *,
         group_size: int,
-        num_groups: int | None = None,
         replacement: bool = True,
         group_key: NestedKey = GROUP_KEY,
         traj_key: NestedKey = TRAJECTORY_KEY,
@@ -421,7 +419,6 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
     ) -> None:
         """Make the sampler; the class describes the arguments."""
         self.group_size = check_group_size(group_size)
-        self.num_groups = None if num_groups is None else check_count("num_groups", num_groups)
         self.replacement = check_flag("replacement", replacement)
         self.group_key, self.traj_key, self.done_key = group_key, traj_key, done_key
         self._empty()
@@ -595,11 +592,9 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
 
     def _num_groups(self, batch_size: int) -> int:
         num_groups, rest = divmod(batch_size, self.group_size)
-        wanted = self.num_groups or num_groups
-        if rest or num_groups != wanted or not num_groups:
-            groups = "num_groups" if self.num_groups is None else f"num_groups={self.num_groups}"
+        if rest or not num_groups:
             raise ValueError(
-                f"The batch size counts trajectories, {groups} * group_size={self.group_size}, "
+                f"The batch size counts trajectories, num_groups * group_size={self.group_size}, "
                 f"got {batch_size}."
             )
         return num_groups

@@ -24,7 +24,6 @@ from torchrl.envs import (
     DMControlEnv,
     DoubleToFloat,
     EnvBase,
-    GymWrapper,
     RewardSum,
     StepCounter,
     TransformedEnv,
@@ -48,7 +47,7 @@ from torchrl_ecpo._torchrl import carrier_of, generator_of, set_carrier
 from torchrl_ecpo.collectors import SupervisedAsyncCollector, SupervisedSyncCollector
 from torchrl_ecpo.collectors.workers import spawn_seeds
 from torchrl_ecpo.envs import EpisodeReplay
-from torchrl_ecpo.experiment._tasks import missing, open_task
+from torchrl_ecpo.experiment._tasks import missing, wrap_task
 from torchrl_ecpo.experiment._videos import greedy_episodes, save_gif, with_pixels
 from torchrl_ecpo.modules import (
     make_action_value_network,
@@ -107,10 +106,10 @@ def make_environment(config: DictConfig, *, seed: int, **pixels: Any) -> EnvBase
         seed: of the episodes.
         pixels: TorchRL's ``from_pixels`` and ``pixels_only``.
     """
-    make = {"gym": _make_gym, "dm_control": _make_dm_control}[config.env.kind]
-    env = make(config.env, **pixels)
+    is_gym = config.env.kind == "gym"
+    env = wrap_task(config.env.name, **pixels) if is_gym else _make_dm_control(config.env, **pixels)
     transforms: list[Any] = [DoubleToFloat(), RewardSum(), StepCounter(), EpisodeReplay()]
-    if config.env.kind == "dm_control":
+    if not is_gym:
         parts = [key for key in list(env.observation_spec.keys()) if key != "pixels"]
         transforms.insert(0, CatTensors(in_keys=sorted(parts), out_key="observation"))
     env = TransformedEnv(env, Compose(*transforms))
@@ -122,12 +121,6 @@ def make_evaluation_environment(config: DictConfig) -> EnvBase:
     """One of its own, which draws where that is asked for."""
     make = partial(make_environment, config, seed=config.seed + 1_000_000)
     return with_pixels(config.env.title, make) if config.evaluation.video else make()
-
-
-def _make_gym(config: DictConfig, *, from_pixels: bool = False, **options: Any) -> EnvBase:
-    drawn: dict[str, Any] = {"render_mode": "rgb_array"} if from_pixels else {}
-    env = open_task(config.name, **drawn)
-    return GymWrapper(env, categorical_action_encoding=True, from_pixels=from_pixels, **options)
 
 
 def _make_dm_control(config: DictConfig, **options: Any) -> EnvBase:

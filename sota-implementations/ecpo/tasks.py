@@ -25,7 +25,6 @@ from torchrl.envs import (
     DoubleToFloat,
     EnvBase,
     ExplorationType,
-    GymWrapper,
     SerialEnv,
     StepCounter,
     TransformedEnv,
@@ -48,7 +47,7 @@ from torchrl_ecpo.envs import (
     EpisodeReplay,
     make_grouped_env,
 )
-from torchrl_ecpo.experiment._tasks import is_plain, open_task
+from torchrl_ecpo.experiment._tasks import is_plain, open_task, wrap_task
 from torchrl_ecpo.modules import (
     PixelEncoder,
     SharedCategorical,
@@ -236,8 +235,7 @@ def make_gym(config: DictConfig) -> Task:
     units = memory.hidden_size if memory is not None and memory.window is None else 0
 
     def make_evaluation_copy() -> EnvBase:
-        copy = GymWrapper(open_task(name, window), categorical_action_encoding=True)
-        return TransformedEnv(copy, EpisodeReplay())
+        return TransformedEnv(wrap_task(name, window), EpisodeReplay())
 
     # By its id a task is played by its own vector entry point, if that can be.
     is_as_it_is = window == 1 and is_plain(name)
@@ -277,12 +275,10 @@ def make_gym(config: DictConfig) -> Task:
     )
 
 
-def make_single(config: DictConfig, *, from_pixels: bool = False, **options: Any) -> EnvBase:
+def make_single(config: DictConfig, **pixels: Any) -> EnvBase:
     """A gymnasium task of no batch size, to look at."""
-    drawn: dict[str, Any] = {"render_mode": "rgb_array"} if from_pixels else {}
-    env = open_task(config.env.name, _window(config.get("policy")), **drawn)
-    options |= {"from_pixels": from_pixels, "categorical_action_encoding": True}
-    return _limited(config, GymWrapper(env, **options))
+    window = _window(config.get("policy"))
+    return _limited(config, wrap_task(config.env.name, window, **pixels))
 
 
 def _window(memory: DictConfig | None) -> int:

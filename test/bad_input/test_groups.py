@@ -26,7 +26,7 @@ ROWS = {
 }
 
 
-OPTIONS = ("group_size", "num_groups", "replacement")
+OPTIONS = ("group_size", "replacement")
 
 
 def steps(entries, *shape):
@@ -71,8 +71,8 @@ SUBJECTS = {
     "`unpack_groups`": Subject(unpack, {MASK: ROWS[MASK]}, optional=(MASK,)),
     "`TrajectoryGroupSampler`": Subject(
         draw,
-        {**STEPS, "group_size": 2, "num_groups": 2, "replacement": True},
-        optional=(TRAJECTORY, "is_init", "num_groups", "replacement"),
+        {**STEPS, "group_size": 2, "replacement": True},
+        optional=(TRAJECTORY, "is_init", "replacement"),
     ),
 }
 

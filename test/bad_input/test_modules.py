@@ -236,8 +236,8 @@ SUBJECTS = {
     ),
     "make_tuple_policy": Subject(
         build(make_tuple_policy, **STEP, **STATE),
-        {"num_observations": 6, "nvec": NVEC, "hidden_size": 8, "distinct_histories": True},
-        optional=["hidden_size", "distinct_histories"],
+        {"num_observations": 6, "nvec": NVEC, "hidden_size": 8},
+        optional=["hidden_size"],
     ),
     "make_tuple_policy, window": Subject(
         build(make_tuple_policy, **STEP, **STATE, **WINDOW),

@@ -32,10 +32,10 @@ exactly = {"rtol": 0, "atol": 0}
 def make_network(window: int) -> DistinctWindowNetwork:
     torch.manual_seed(0)
     network = torch.nn.Sequential(
-        OneHotLinear(NUM_CLASSES * window, 5, dtype=torch.float64),
+        OneHotLinear(NUM_CLASSES * window, 5),
         torch.nn.Tanh(),
-        torch.nn.Linear(5, 2, dtype=torch.float64),
-    )
+        torch.nn.Linear(5, 2),
+    ).double()
     return DistinctWindowNetwork(NUM_CLASSES, network, window, in_keys=["inputs"])
 
 

@@ -29,7 +29,6 @@ class PlayerCollector(BaseCollector):
 
     trajs_per_batch = None  # TorchRL's way of cutting whole trajectories from batches of frames
     init_random_frames = 0
-    _has_factory = False
     _workers: Workers
 
     def __init__(
@@ -110,8 +109,6 @@ class PlayerCollector(BaseCollector):
             self._moded = source
             own: Any = TensorDict.from_module(source)
             source = own.data
-        elif source is None and self._has_factory:
-            raise ValueError("policy_factory made the policy: give its weights.")
         if isinstance(source, TensorDictBase):
             self._workers.set_weights(source)
         elif source is not self._learner:  # which may be a function, without weights

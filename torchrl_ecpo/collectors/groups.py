@@ -16,7 +16,7 @@ from torch import nn
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
-from torchrl_ecpo.checks import check_count, check_flag, check_group_size
+from torchrl_ecpo.checks import check_choice, check_count, check_flag, check_group_size
 from torchrl_ecpo.collectors._base import PlayerCollector, check_makers
 from torchrl_ecpo.collectors.rollout import GroupPlayer
 from torchrl_ecpo.collectors.workers import Workers
@@ -37,7 +37,11 @@ _REFUSED = {
     "auto_register_policy_transforms": "what the policy needs of the environment is always added",
     "compile_policy": "the number of rows that the policy sees changes",
     "cudagraph_policy": "the number of rows that the policy sees changes",
-    "device": "say which, policy_device, env_device or storing_device",
+    "device": "say policy_device, and move the environment to its own",
+    "env_device": "move the environment, env.to(device)",
+    "storing_device": "move the batches, postproc=lambda batch: batch.to(device)",
+    "policy_factory": "policies travel to the workers by value",
+    "max_frames_per_traj": "append StepCounter(max_steps=...) to the environment",
     "weight_sync_schemes": "workers are sent the weights with their next batch",
 }
 
@@ -72,8 +76,6 @@ class TrajectoryGroupCollector(PlayerCollector):
             for as many workers. Workers need makers, which travel by value.
         policy: what acts, a ``TensorDictModule`` or what takes and returns a TensorDict. Default:
             random actions.
-        policy_factory: what makes it, once in each worker, instead of `policy`. Its weights change
-            only when :meth:`update_policy_weights_` is given some.
         num_groups: `G`, a multiple of the environment's `prod(B)` (of all workers', with `sync`).
         group_size: `K`, at least 2.
         backend: ``"direct"``, in this process, ``"process"``, in worker processes, or ``"ray"``, in
@@ -91,14 +93,11 @@ class TrajectoryGroupCollector(PlayerCollector):
         exclude_keys: more entries to leave out, with what is nested in them, such as logits and
             features that a loss computes itself.
         max_steps: the length at which a trajectory is taken to be endless. Default: 10,000.
-        max_frames_per_traj: cut trajectories at this length, by a ``StepCounter``. Default: never.
         group_key: the environment's key of the problem instance.
         exploration_type: how actions are drawn. Default: TorchRL's, at random.
         postproc: what is done to each batch before it is handed over or written.
         replay_buffer: where to write the steps of each batch, flat; None is yielded instead.
-        policy_device: of the policy. Default: where it is.
-        env_device: of the environment. Default: where it is.
-        storing_device: of the batches. Default: the environment's.
+        policy_device: of the policy, which acts there. Default: where it is.
 
     Raises:
         TypeError: for an argument that does not go with groups or is of another class, and for an
@@ -159,7 +158,6 @@ class TrajectoryGroupCollector(PlayerCollector):
         super().__init__(policy, total_frames, postproc, replay_buffer)
         self.num_groups, self.group_size = num_groups, group_size
         self.requested_frames_per_batch = num_groups * group_size  # at least
-        self._has_factory = "policy_factory" in options
         is_here = backend == "direct"
         options |= {"num_groups": share, "group_size": group_size}
         is_copied = is_here and isinstance(policy, nn.Module)  # what travels is a copy
@@ -196,10 +194,7 @@ def _find_makers(
     has_workers = several or num_collectors is not None
     if backend is None:
         backend = "process" if has_workers else "direct"
-    if backend not in ("direct", "process", "ray"):
-        raise ValueError(
-            f"backend={backend!r} does not collect groups; 'direct', 'process' and 'ray' do."
-        )
+    check_choice("backend", backend, ("direct", "process", "ray"))
     if backend == "direct" and (has_workers or sync is not None):
         raise ValueError(
             "sync, num_collectors and lists of environment makers are for workers: sync needs "

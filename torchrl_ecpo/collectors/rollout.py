@@ -18,7 +18,6 @@ from torchrl.envs import (
     Compose,
     EnvBase,
     InitTracker,
-    StepCounter,
     TransformedEnv,
 )
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -45,21 +44,17 @@ class GroupPlayer:
         self,
         create_env_fn: EnvBase | Callable[[], EnvBase],
         policy: Callable[[Any], Any] | None = None,
-        policy_factory: Callable[[], Callable[[Any], Any]] | None = None,
         *,
         num_groups: int,
         group_size: int,
         compact_obs: bool = True,
         exclude_keys: Collection[NestedKey] = (),
         max_steps: int = 10_000,
-        max_frames_per_traj: int | None = None,
         group_key: NestedKey = GROUP_KEY,
         exploration_type: Any = ExplorationType.RANDOM,
         policy_device: torch.device | str | None = None,
-        env_device: torch.device | str | None = None,
-        storing_device: torch.device | str | None = None,
     ) -> None:
-        """Make the environment, and the policy if a factory is given."""
+        """Make the environment."""
         self.num_groups, self.group_size, self.group_key = num_groups, group_size, group_key
         self.compact_obs = check_flag("compact_obs", compact_obs)
         self.exclude_keys = set(check_keys("exclude_keys", exclude_keys) if exclude_keys else ())
@@ -69,18 +64,10 @@ class GroupPlayer:
         except ValueError as error:
             raise ValueError(f"exploration_type: {error}.") from None
         self.exploration_type = exploration_type
-        self.policy_device, self.storing_device = policy_device, storing_device
+        self.policy_device = policy_device
         env = create_env_fn if isinstance(create_env_fn, EnvBase) else create_env_fn()
         check_kind("What create_env_fn makes", env, EnvBase)
-        env = env if env_device is None else env.to(env_device)
-        if max_frames_per_traj is not None:
-            frames = check_count("max_frames_per_traj", max_frames_per_traj)
-            env = TransformedEnv(env, StepCounter(frames), auto_unwrap=False)
         self._check_env(env)
-        if policy_factory is not None:
-            if policy is not None:
-                raise TypeError("policy_factory makes the policy, so that policy must be None.")
-            policy = policy_factory()
         self.policy: Any = RandomPolicy(env.full_action_spec) if policy is None else policy
         if isinstance(self.policy, RandomPolicy):
             self.policy.set_action_spec_from_env(env)
@@ -184,8 +171,8 @@ class GroupPlayer:
         self._next_id += len(mask)
         batch.set(TRAJECTORY_KEY, ids.unsqueeze(-1) * mask)
         batch.set(self.group_key, torch.cat(groups).unsqueeze(-1) * mask)
-        batch: Any = batch.unflatten(0, (self.num_groups, self.group_size))
-        return batch if self.storing_device is None else batch.to(self.storing_device)
+        laid_out: Any = batch.unflatten(0, (self.num_groups, self.group_size))
+        return laid_out
 
     def _play_round(self, steps: list[_Step], first: int) -> Tensor:
         """Play trajectories `first` to `first + N`, one in each row; return their groups `[N]`."""
@@ -218,7 +205,7 @@ class GroupPlayer:
         raise RuntimeError(
             f"{len(rows)} trajectories, the first one of group {int(group[rows[0]])}, have not "
             f"ended after max_steps={self.max_steps} steps. Limit their length: append "
-            "StepCounter(max_steps=...) to the environment, or pass max_frames_per_traj."
+            "StepCounter(max_steps=...) to the environment."
         )
 
     def _check_groups(self, root: TensorDictBase) -> Tensor:

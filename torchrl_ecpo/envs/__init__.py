@@ -1,8 +1,8 @@
 """The paper's problems as batched TorchRL environments, and groups over any environment."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from torchrl_ecpo._lazy import importing
 from torchrl_ecpo.envs._groups import GroupIdAllocator
 from torchrl_ecpo.envs.algorithmic import TASKS, AlgorithmicEnv, AlgorithmicTask
 from torchrl_ecpo.envs.bandit import BanditEnv
@@ -28,15 +28,5 @@ __all__ = [
     "readable",
 ]
 
-OF_GYMNASIUM = {
-    "VectorGroupedEnv": "vector",
-    "make_grouped_env": "vector",
-    "readable": "plain_spaces",
-}
-
-
-def __getattr__(name: str) -> Any:
-    """What needs gymnasium is imported where it is first asked for: the rest does without."""
-    if name in OF_GYMNASIUM:
-        return getattr(import_module(f"{__name__}.{OF_GYMNASIUM[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+# What needs gymnasium is imported where it is first asked for: the rest does without.
+__getattr__ = importing(__name__, "plain_spaces", "vector")

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
-from torchrl.data import Unbounded
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_ecpo.checks import check_count, check_kind
@@ -44,9 +44,6 @@ class GroupIdAllocator:
         """Return the id of a thing that has a key: the same whenever this process asks.
 
         It is a hash of 63 bits: a million of them collide with a probability of one in 20 million.
-
-        Args:
-            key: non-negative integers; anything else is a ValueError.
         """
         key = tuple(check_count("key", part, least=0) for part in key)
         self._renew_elsewhere()
@@ -69,13 +66,8 @@ class GroupIdAllocator:
     def allocate(self, count: int, *, stride: int = 1) -> torch.Tensor:
         """Return `count` new ids, int64 `[count]` on the CPU.
 
-        Args:
-            count: how many.
-            stride: the distance from one id to the next; the ids in between are reserved, for a
-                caller who tells variants of one instance apart. Default: 1.
-
-        Raises:
-            ValueError: if one call asks for more ids than the counter holds.
+        They are `stride` apart; the ids in between are reserved, for a caller who tells variants of
+        one instance apart.
         """
         count, stride = check_count("count", count, least=0), check_count("stride", stride)
         span = count * stride
@@ -107,6 +99,40 @@ def check_owner(state: Mapping[str, Any], own: str) -> None:
     owner = state.get("env", own)
     if owner != own:
         raise ValueError(f"The state is of another environment: of {owner}, and this is {own}.")
+
+
+class OneInstance(EnvBase):
+    """Rows of copies `[G, K]` that all play one problem instance, in which nothing is random.
+
+    Who extends this calls :meth:`_set_specs`, and writes ``_reset`` and ``_step``.
+    """
+
+    _group: torch.Tensor
+
+    def __init__(self, num_groups: int, group_size: int, device: torch.device | str | None) -> None:
+        rows = (check_count("num_groups", num_groups), check_count("group_size", group_size))
+        super().__init__(batch_size=torch.Size(rows), device=device)
+        # A row's group stays the same from episode to episode.
+        group = GroupIdAllocator().allocate(rows[0]).to(self.device)
+        self.register_buffer("_group", group.unsqueeze(-1).expand(rows).clone())
+
+    def _set_specs(self, observation: TensorSpec, num_actions: int) -> None:
+        shape, one = self.batch_size, torch.Size((*self.batch_size, 1))
+        group = Unbounded(shape, dtype=torch.int64)
+        self.observation_spec = Composite(observation=observation, group=group, shape=shape)
+        self.action_spec = Composite(action=Categorical(num_actions, shape=shape), shape=shape)
+        self.reward_spec = Composite(reward=Unbounded(one), shape=shape)
+        flag = Categorical(2, shape=one, dtype=torch.bool)
+        self.done_spec = Composite(done=flag, terminated=flag.clone(), shape=shape)
+
+    def _show(self, observation: torch.Tensor, done: torch.Tensor) -> TensorDict:
+        """What a step or a reset returns."""
+        shown = {"observation": observation, "group": self._group.clone()}
+        shown |= {"done": done, "terminated": done.clone()}
+        return TensorDict(shown, batch_size=self.batch_size, device=self.device)
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Nothing to seed: `instance_seed` draws the instance, and an episode is not random."""
 
 
 class SeededGroups(EnvBase):

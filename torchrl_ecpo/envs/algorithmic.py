@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torchrl.data import Categorical, Composite, MultiCategorical, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_ecpo.checks import check_count, check_kind, described, get_entry
+from torchrl_ecpo.checks import check_choice, check_count, check_kind, described, get_entry
 from torchrl_ecpo.envs._groups import GroupIdAllocator, check_owner
 
 __all__ = ["TASKS", "AlgorithmicEnv", "AlgorithmicTask"]
@@ -304,17 +304,14 @@ class AlgorithmicEnv(EnvBase):
     -1 as padding. Identical instances in a row get one `group`. They count for the curriculum like
     drawn ones, at the present level, and leave the row's sequence of drawn instances alone.
 
-    **Curriculum.** `min_length` goes up by one, to 30 at most, after `last` successes in a row
-    (see `TASKS`). A success is, in effect, a perfect episode, counted when a reset follows.
+    **Curriculum.** `min_length` goes up by one, to 30 at most, after `last` successes in a row (see
+    `TASKS`). A success is, in effect, a perfect episode, counted when a reset follows.
 
-    - `"group"`: a level for each row. An instance counts once, by its first copy: counting every
-      copy would promote too early, as the copies of an easy instance succeed together.
+    - `"group"`: a level for each row. An instance counts once, by its first copy.
     - `"batch"`: one level for all rows. Each instance counts once, in order of reset, then of row,
       with at most one promotion a reset.
-    - `"gym"`: a level for each copy, by gym's rule to the letter. Interrupted episodes count. So
-      does the episode that gym's constructor starts, with return 0. The copies of a row share the
-      random draw; those at one level play the identical instance, and `group` tells the levels
-      apart.
+    - `"gym"`: a level for each copy, by gym's rule to the letter. The copies of a row share the
+      random draw; those at one level play the identical instance, and `group` tells them apart.
     - `None`: `min_length` stays.
 
     `"group"` and `"batch"` count no interrupted episodes, nor instances drawn before the latest
@@ -411,10 +408,7 @@ class AlgorithmicEnv(EnvBase):
                 f"min_length of {self.task_name} must lie in {lowest}..{_TOP_LEVEL}, "
                 f"got {min_length}."
             )
-        if curriculum not in ("group", "batch", "gym", None):
-            raise ValueError(
-                f"curriculum must be 'group', 'batch', 'gym' or None, got {curriculum!r}."
-            )
+        check_choice("curriculum", curriculum, ("group", "batch", "gym", None))
 
     def get_extra_state(self) -> dict[str, str]:
         """Which environment the state is of."""

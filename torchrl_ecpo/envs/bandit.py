@@ -5,16 +5,15 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.data import Unbounded
 
 from torchrl_ecpo.checks import as_float, check_count, check_kind, described, get_choice
-from torchrl_ecpo.envs._groups import GroupIdAllocator
+from torchrl_ecpo.envs._groups import OneInstance
 
 __all__ = ["BanditEnv"]
 
 
-class BanditEnv(EnvBase):
+class BanditEnv(OneInstance):
     """A bandit with many actions, few good ones, and a feature vector for each action.
 
     Section 5.1 of Mei et al., IJCAI 2019: the reward of action i is s_i^8 with s_i uniform on
@@ -50,7 +49,6 @@ class BanditEnv(EnvBase):
 
     rewards: Tensor
     features: Tensor
-    _group: Tensor
 
     def __init__(
         self,
@@ -65,34 +63,17 @@ class BanditEnv(EnvBase):
     ) -> None:
         num_actions = check_count("num_actions", num_actions)
         num_features = check_count("num_features", num_features)
-        num_groups = check_count("num_groups", num_groups)
-        group_size = check_count("group_size", group_size)
         instance_seed = check_count("instance_seed", instance_seed, least=0)
         if not 0 <= as_float("exponent", exponent) < float("inf"):
             raise ValueError(f"exponent must be a finite number >= 0, got {exponent!r}.")
-        super().__init__(batch_size=torch.Size([num_groups, group_size]), device=device)
+        super().__init__(num_groups, group_size, device)
         generator = torch.Generator().manual_seed(instance_seed)
         rewards = torch.rand(num_actions, generator=generator).pow(exponent)
         features = torch.randn(num_actions, num_features, generator=generator)
         self.register_buffer("rewards", rewards.to(self.device))
         self.register_buffer("features", features.to(self.device))
-        # One problem instance, so a row's group stays the same from episode to episode.
-        group = GroupIdAllocator().allocate(num_groups).to(self.device)
-        self.register_buffer("_group", group.unsqueeze(-1).expand(self.batch_size).clone())
-        self._make_specs(num_actions)
-
-    def _make_specs(self, num_actions: int) -> None:
-        shape = self.batch_size
-        one = torch.Size((*shape, 1))
-        self.observation_spec = Composite(
-            observation=Unbounded(one, dtype=torch.float32),
-            group=Unbounded(shape, dtype=torch.int64),
-            shape=shape,
-        )
-        self.action_spec = Composite(action=Categorical(num_actions, shape=shape), shape=shape)
-        self.reward_spec = Composite(reward=Unbounded(one), shape=shape)
-        flag = Categorical(2, shape=one, dtype=torch.bool)
-        self.done_spec = Composite(done=flag, terminated=flag.clone(), shape=shape)
+        one = torch.Size((*self.batch_size, 1))
+        self._set_specs(Unbounded(one, dtype=torch.float32), num_actions)
 
     def expected_reward(self, probabilities: Tensor) -> Tensor:
         """Exact expected reward ``[...]`` of action probabilities ``[..., num_actions]``."""
@@ -116,18 +97,5 @@ class BanditEnv(EnvBase):
         return self.rewards[action]
 
     def _output(self, *, done: bool) -> TensorDict:
-        one = (*self.batch_size, 1)
-        flag = torch.full(one, done, device=self.device)
-        return TensorDict(
-            {
-                "observation": torch.ones(one, device=self.device),
-                "group": self._group.clone(),
-                "done": flag,
-                "terminated": flag.clone(),
-            },
-            batch_size=self.batch_size,
-            device=self.device,
-        )
-
-    def _set_seed(self, seed: int | None) -> None:
-        """Nothing to seed: `instance_seed` draws the rewards, and an episode is not random."""
+        flag = torch.full((*self.batch_size, 1), done, device=self.device)
+        return self._show(torch.ones(flag.shape, device=self.device), flag)

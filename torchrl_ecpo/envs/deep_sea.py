@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.data import Categorical
 
 from torchrl_ecpo.checks import check_count, get_choice
-from torchrl_ecpo.envs._groups import GroupIdAllocator
+from torchrl_ecpo.envs._groups import OneInstance
 
 __all__ = ["DeepSeaEnv"]
 
 
-class DeepSeaEnv(EnvBase):
+class DeepSeaEnv(OneInstance):
     r"""A diver in a square of `size` x `size` cells, one row lower after each step.
 
     The problem of Osband et al., Behaviour Suite for Reinforcement Learning (ICLR 2020), with its
@@ -47,7 +46,6 @@ class DeepSeaEnv(EnvBase):
     """
 
     right: Tensor
-    _group: Tensor
 
     def __init__(
         self,
@@ -59,27 +57,12 @@ class DeepSeaEnv(EnvBase):
         device: torch.device | str | None = None,
     ) -> None:
         self.size = check_count("size", size)
-        shape = torch.Size(
-            [check_count("num_groups", num_groups), check_count("group_size", group_size)]
-        )
         instance_seed = check_count("instance_seed", instance_seed, least=0)
-        super().__init__(batch_size=shape, device=device)
+        super().__init__(num_groups, group_size, device)
         generator = torch.Generator().manual_seed(instance_seed)
         right = torch.randint(2, (self.size**2 + 1,), generator=generator)
         self.register_buffer("right", right.to(self.device))
-        # One problem instance, so a row's group stays the same from episode to episode.
-        group = GroupIdAllocator().allocate(shape[0]).to(self.device)
-        self.register_buffer("_group", group.unsqueeze(-1).expand(shape).clone())
-        self.observation_spec = Composite(
-            observation=Categorical(self.size**2 + 1, shape=shape),
-            group=Unbounded(shape, dtype=torch.int64),
-            shape=shape,
-        )
-        self.action_spec = Composite(action=Categorical(2, shape=shape), shape=shape)
-        column = torch.Size([*shape, 1])
-        self.reward_spec = Composite(reward=Unbounded(column), shape=shape)
-        flag = Categorical(2, shape=column, dtype=torch.bool)
-        self.done_spec = Composite(done=flag, terminated=flag.clone(), shape=shape)
+        self._set_specs(Categorical(self.size**2 + 1, shape=self.batch_size), 2)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         start = torch.zeros(self.batch_size, dtype=torch.int64, device=self.device)
@@ -98,18 +81,5 @@ class DeepSeaEnv(EnvBase):
         after = (size * (row + 1) + column).clamp(max=size**2)
         return self._output(after).set("reward", reward.unsqueeze(-1))
 
-    def _output(self, cell: Tensor) -> TensorDict:
-        done = (cell == self.size**2).unsqueeze(-1)
-        return TensorDict(
-            {
-                "observation": cell,
-                "group": self._group.clone(),
-                "done": done,
-                "terminated": done.clone(),
-            },
-            batch_size=self.batch_size,
-            device=self.device,
-        )
-
-    def _set_seed(self, seed: int | None) -> None:
-        """Nothing to seed: `instance_seed` draws the actions, and an episode is not random."""
+    def _output(self, cell: Tensor) -> TensorDictBase:
+        return self._show(cell, (cell == self.size**2).unsqueeze(-1))

@@ -7,7 +7,7 @@ from torchrl_ecpo._lazy import importing
 if TYPE_CHECKING:
     from torchrl_ecpo.experiment.checkpoint import Checkpoints, Progress, restore_part
     from torchrl_ecpo.experiment.compiling import compile_module
-    from torchrl_ecpo.experiment.options import check_command_line, check_options, compose_options
+    from torchrl_ecpo.experiment.options import check_command_line, compose_options
     from torchrl_ecpo.experiment.run import MetricsTable, Run, leaving_nothing, read_metrics
 
 __all__ = [
@@ -16,7 +16,6 @@ __all__ = [
     "Progress",
     "Run",
     "check_command_line",
-    "check_options",
     "compile_module",
     "compose_options",
     "leaving_nothing",

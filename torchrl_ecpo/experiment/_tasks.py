@@ -9,21 +9,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import FrameStackObservation
+from torchrl.envs import GymWrapper
 
 from torchrl_ecpo.envs import readable
 
 
 def open_raw_task(name: str, **options: Any) -> gym.Env:
-    """A task of gymnasium, as it is.
-
-    Args:
-        name: its id.
-        options: of ``gymnasium.make``.
-
-    Raises:
-        ModuleNotFoundError: if a package is missing.
-        ValueError: if there is no such task.
-    """
+    """A task of gymnasium by its id, as it is, or an error that names ``env.name``."""
     try:
         return gym.make(name, disable_env_checker=True, **options)
     except (gym.error.DependencyNotInstalled, ModuleNotFoundError) as error:
@@ -48,6 +40,15 @@ def open_task(name: str, window: int = 1, **options: Any) -> gym.Env:
         return readable(FrameStackObservation(env, window, padding_type="zero"))
     except ValueError as error:
         raise ValueError(f"env.name: {error}") from error
+
+
+def wrap_task(
+    name: str, window: int = 1, *, from_pixels: bool = False, **options: Any
+) -> GymWrapper:
+    """The same as an environment of TorchRL; `options` are its wrapper's."""
+    drawn: dict[str, Any] = {"render_mode": "rgb_array"} if from_pixels else {}
+    options |= {"from_pixels": from_pixels, "categorical_action_encoding": True}
+    return GymWrapper(open_task(name, window, **drawn), **options)
 
 
 @cache

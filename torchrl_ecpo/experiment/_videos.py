@@ -15,14 +15,9 @@ LONGEST_EPISODE = 100_000
 
 
 def with_pixels(name: str, make: Callable[..., EnvBase]) -> EnvBase:
-    """An environment that shows what it draws too, as ``"pixels"``.
+    """An environment that shows what it draws too, as ``"pixels"``; or a ValueError, with the mend.
 
-    Args:
-        name: of the task.
-        make: makes it, given TorchRL's ``from_pixels``.
-
-    Raises:
-        ValueError: if it cannot be drawn, with what that takes.
+    `make` makes it, given TorchRL's ``from_pixels``.
     """
     os.environ.setdefault("MUJOCO_GL", "egl")
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # gymnasium draws into memory
@@ -56,15 +51,7 @@ def save_gif(file: Path, episode: TensorDictBase) -> None:
 
 
 def show(make: Callable[..., EnvBase], policy: Any, count: int, directory: Path, name: str) -> None:
-    """Play a task greedily, print the returns, and leave a gif of the first episode.
-
-    Args:
-        make: makes the environment, given TorchRL's ``from_pixels``.
-        policy: acts in it.
-        count: number of episodes.
-        directory: of the run.
-        name: of the task.
-    """
+    """Play a task greedily, print the returns, and leave a gif of the first episode."""
     try:
         env = with_pixels(name, make)
     except ValueError as error:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from copy import deepcopy
 from pathlib import Path
-from types import FrameType, SimpleNamespace, TracebackType
+from types import FrameType, SimpleNamespace
 from typing import Any
 
 from hydra.core.override_parser.types import Quote, QuotedString
@@ -274,12 +274,7 @@ class Checkpoints:
             signal.signal(name, handler)
         self._handlers = {}
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
         """Write a last checkpoint: at the end, if a worker died, and if a loss was not finite.
 
         All three are noticed before the parameters change, so that the state is still good.

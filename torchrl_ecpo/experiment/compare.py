@@ -74,11 +74,9 @@ class Comparison:
 
 
 def area(steps: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Area under the curve over the length of the run: the mean of the metric, ``[runs]``.
+    """Mean of the metric over the run, ``[runs]``: the area under the curve over its length.
 
-    Args:
-        steps: ``[n]``.
-        values: ``[runs, n]``, joined by straight lines.
+    Values ``[runs, n]``, at steps ``[n]``, are joined by straight lines.
 
     Examples:
         >>> area(np.array([0, 10, 40]), np.array([[0.0, 2.0, 4.0]])).tolist()
@@ -91,11 +89,7 @@ def area(steps: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def final(steps: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Mean of the metric over the last tenth of the steps, ``[runs]``.
-
-    Args:
-        steps: ``[n]``.
-        values: ``[runs, n]``.
+    """Mean of values ``[runs, n]`` over the last tenth of the steps ``[n]``: ``[runs]``.
 
     Examples:
         >>> final(np.array([10, 90, 95, 100]), np.array([[0.0, 1.0, 2.0, 4.0]])).tolist()

@@ -29,7 +29,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-__all__ = ["check_command_line", "check_options", "compose_options", "expand", "parse"]
+__all__ = ["check_command_line", "compose_options", "expand", "parse"]
 
 _LIMITS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
 _EXPONENTIAL = re.compile(r"(?<![\w./'\"-])\d+(?:\.\d+)?[eE]\+?\d+(?![\w./])")
@@ -116,10 +116,15 @@ def expand(options: Sequence[str]) -> list[list[str]]:
 
 
 def compose_options(folder: Path, options: Sequence[str], name: str = "config") -> DictConfig:
-    """Compose the configuration of a run, and check it by :func:`check_options`.
+    """Compose the configuration of a run, and check its options.
 
-    The defaults are those of the groups that are chosen, such as ``env=`` and ``loss=``. What
-    options take that are of more than one kind, or within limits, is in ``options.yaml``.
+    The defaults are those of the groups that are chosen, such as ``env=`` and ``loss=``. By default
+    ``true`` stands for a flag, ``1`` for an integer of at least 1 (``0``: of at least 0), ``1.0``
+    for a number of at least 0, and null for anything. What else options take is in
+    ``options.yaml``, by name: kinds and words, with ``or`` between them. A kind is ``an integer``
+    or ``a number``, with limits (``a number > 0 and <= 1``), ``text``, ``a mapping``,
+    ``a schedule`` or ``anything``; a word is taken as it is (``null``). ``now NAME`` says what an
+    option is called that had another name.
 
     Args:
         folder: of the script, with ``config/`` and, where needed, ``options.yaml``.
@@ -127,7 +132,8 @@ def compose_options(folder: Path, options: Sequence[str], name: str = "config") 
         name: of the configuration.
 
     Raises:
-        ValueError: for an option that does not exist, or whose value is of another kind.
+        ValueError: for options that do not exist, or whose value is of another kind, with a line
+            for each: the option, what was expected, and what came.
         HydraException: for what hydra refuses.
     """
     file, options = folder.resolve() / "options.yaml", [*map(_whole, options)]
@@ -188,47 +194,6 @@ def _whole(option: str) -> str:
 def _defaults(file: Path, name: str, chosen: tuple[str, ...]) -> DictConfig:
     """What a study composes again and again: for a script, by the file that is beside it."""
     return compose(name, list(chosen))
-
-
-def check_options(
-    config: DictConfig,
-    defaults: DictConfig,
-    kinds: Mapping[str, str],
-    groups: Collection[str] = (),
-) -> None:
-    """Refuse options that do not exist or whose value is not of the kind of the default.
-
-    By default ``true`` stands for a flag, ``1`` for an integer of at least 1 (``0``: of at least
-    0), ``1.0`` for a number of at least 0, and null for anything.
-
-    Args:
-        config: of a run.
-        defaults: the same without what a user has changed.
-        kinds: what else options take, by name: kinds and words, with ``or`` between them. A kind is
-            ``an integer`` or ``a number``, with limits (``a number > 0 and <= 1``), ``text``,
-            ``a mapping``, ``a schedule`` or ``anything``; a word is taken as it is (``null``).
-            ``now NAME`` says what an option is called that had another name.
-        groups: further names that a user may have meant.
-
-    Raises:
-        ValueError: with a line for each: the option, what was expected, and what came.
-
-    Examples:
-        >>> defaults = OmegaConf.create({"compile": False, "optim": {"lr": 0.1}})
-        >>> config = OmegaConf.create({"compile": "no", "optim": {"lr": 0.1}})
-        >>> check_options(config, defaults, {})
-        Traceback (most recent call last):
-            ...
-        ValueError: compile must be true or false, got 'no'.
-        >>> config = OmegaConf.create({"compile": False, "optim": {"lr": 0.1, "learnrate": 1}})
-        >>> check_options(config, defaults, {"optim.lr": "a number > 0"})
-        Traceback (most recent call last):
-            ...
-        ValueError: There is no option optim.learnrate; the nearest one is optim.lr.
-    """
-    problems = [*_problems(config, defaults, kinds, groups)]
-    if problems:
-        raise ValueError("\n".join(problems))
 
 
 def _problems(

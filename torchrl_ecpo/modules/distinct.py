@@ -100,14 +100,7 @@ class DistinctCore(TensorDictModuleBase):
         yield None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the output; in sampling also the next states.
-
-        Args:
-            tensordict: `[*B]`, or `[*B, T]` in recurrent mode.
-
-        Returns:
-            The same tensordict.
-        """
+        """Write the output into `[*B]`, or `[*B, T]` in recurrent mode; in sampling next states."""
         return self.write(tensordict, self.read(tensordict))
 
     def write(self, tensordict: TensorDictBase, found: Evaluated) -> TensorDictBase:
@@ -169,11 +162,7 @@ class DistinctCore(TensorDictModuleBase):
         return (classes * weights).sum(-1)
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
-        """The transform that lets an environment carry the states from step to step.
-
-        Returns:
-            A :class:`torchrl.envs.TensorDictPrimer`; collectors append it by themselves.
-        """
+        """The transform that carries the states from step to step; collectors append it."""
         return _TransientPrimer(self.state_specs(), expand_specs=True)
 
     def state_specs(self) -> dict[NestedKey, TensorSpec]:

@@ -54,8 +54,6 @@ class DistinctHistoryLSTM(DistinctCore):
             layer to logits. Default None: the output is the LSTM's.
         in_keys: the integer inputs, each `[*B]` or `[*B, d]`.
         out_key: the output. Default "embed".
-        device: of the parameters.
-        dtype: of the parameters.
 
     Attributes:
         cell: the `torch.nn.LSTMCell` that holds the parameters, initialised by PyTorch: uniform in
@@ -93,12 +91,10 @@ class DistinctHistoryLSTM(DistinctCore):
         *,
         in_keys: Sequence[NestedKey],
         out_key: str = "embed",
-        device: torch.device | str | None = None,
-        dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__(num_classes, in_keys=in_keys, out_key=out_key)
         self.hidden_size = check_count("hidden_size", hidden_size)
-        self.cell = nn.LSTMCell(sum(self.num_classes), self.hidden_size, device=device, dtype=dtype)
+        self.cell = nn.LSTMCell(sum(self.num_classes), self.hidden_size)
         self.readout = nn.Identity() if readout is None else readout
         check_kind("readout", self.readout, nn.Module)
 

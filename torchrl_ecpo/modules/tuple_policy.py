@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from copy import copy
 from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torch.distributions import Distribution, constraints
 from torch.distributions.utils import lazy_property
 from torch.nn import functional as F
 from torchrl.envs import ExplorationType, exploration_type
-from torchrl.modules import LSTMModule, ProbabilisticActor
+from torchrl.modules import ProbabilisticActor
 
 from torchrl_ecpo.checks import check_count, check_counts, check_flag, check_kind, described
-from torchrl_ecpo.modules.distinct import DistinctCore, Evaluated, take_rows
+from torchrl_ecpo.modules.distinct import Evaluated, take_rows
 from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
 from torchrl_ecpo.modules.windows import DistinctWindowNetwork, OneHotLinear
 
@@ -124,28 +123,14 @@ class TupleCategorical(Distribution):
         return other
 
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
-        """Draw actions, each part by inverting its distribution function.
-
-        Args:
-            sample_shape: the shape of the sample, before the batch shape.
-
-        Returns:
-            int64 `[*sample_shape, *B, 3]`.
-        """
+        """Draw int64 actions `[*sample_shape, *B, 3]`, each part by inverting its distribution."""
         # Numbers of half precision are so coarse that 0 is among a few hundred.
         dtype = torch.promote_types(self._table.dtype, torch.float32)
         shape = (*sample_shape, *self.batch_shape, 3)
         return self.choose(torch.rand(shape, dtype=dtype, device=self._table.device))
 
     def choose(self, uniform: Tensor) -> Tensor:
-        """Draw actions with given randomness.
-
-        Args:
-            uniform: drawn uniformly from [0, 1), `[*sample_shape, *B, 3]`.
-
-        Returns:
-            int64 `[*sample_shape, *B, 3]`.
-        """
+        """Draw int64 actions with given numbers from [0, 1), both `[*sample_shape, *B, 3]`."""
         bounds = self._of_rows(self._bounds).to(uniform.dtype)
         bounds = bounds.expand(*uniform.shape, -1).contiguous()
         choice = torch.searchsorted(bounds, uniform.unsqueeze(-1), right=True).squeeze(-1)
@@ -153,14 +138,7 @@ class TupleCategorical(Distribution):
         return choice
 
     def sample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
-        """Draw actions and give their log-probabilities; there is no need to check their range.
-
-        Args:
-            sample_shape: the shape of the sample, before the batch shape.
-
-        Returns:
-            int64 `[*sample_shape, *B, 3]` and `[*sample_shape, *B]`.
-        """
+        """Draw actions `[*sample_shape, *B, 3]`, with log-probabilities `[*sample_shape, *B]`."""
         action = self.sample(sample_shape)
         return action, self._score(action)
 
@@ -176,13 +154,7 @@ class TupleCategorical(Distribution):
     deterministic_sample = mode  # which `ExplorationType.DETERMINISTIC` asks for
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log-probability of actions.
-
-        Args:
-            value: int64 `[..., 3]`, broadcast against the batch shape.
-
-        Returns:
-            `[...]`.
+        """Log-probability `[...]` of int64 actions `[..., 3]`, broadcast against the batch shape.
 
         Raises:
             ValueError: if an action is out of range.
@@ -294,8 +266,6 @@ class TupleTables(nn.Module):
             previous action's parts, each with one more for none.
         window: how many steps are seen, at least 2.
         hidden_size: of the hidden layer (ReLU).
-        device: of the parameters.
-        dtype: of the parameters.
 
     Raises:
         TypeError: if `num_classes` is no sequence.
@@ -318,32 +288,22 @@ class TupleTables(nn.Module):
         num_classes: Sequence[int],
         window: int,
         hidden_size: int = 64,
-        device: torch.device | str | None = None,
-        dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
         self.window = check_count("window", window, least=2)
-        factory: dict[str, Any] = {"device": device, "dtype": dtype}
         observations, moves, _, characters = self.num_classes = check_counts(
             "num_classes", num_classes
         )
         self.num_moves, self.num_characters = moves - 1, characters - 1
         num_logits = self.num_moves + 2 + self.num_characters
-        self.hidden = OneHotLinear(self.num_classes, hidden_size, **factory)
-        self.readout = nn.Linear(hidden_size, num_logits, **factory)
+        self.hidden = OneHotLinear(self.num_classes, hidden_size)
+        self.readout = nn.Linear(hidden_size, num_logits)
         num_rows = (observations + 1) ** window * characters
-        self.characters = nn.Parameter(torch.zeros(num_rows, self.num_characters, **factory))
-        self.moves = nn.Parameter(torch.zeros((moves + 1) ** 2, self.num_moves, **factory))
+        self.characters = nn.Parameter(torch.zeros(num_rows, self.num_characters))
+        self.moves = nn.Parameter(torch.zeros((moves + 1) ** 2, self.num_moves))
 
     def forward(self, classes: Tensor) -> Tensor:
-        """The logits of windows.
-
-        Args:
-            classes: int64 `[n, window, 4]`, the present step first; -1 where there is none.
-
-        Returns:
-            `[n, L]`.
-        """
+        """Logits `[n, L]` of int64 windows `[n, window, 4]`, the present step first, -1: none."""
         observation, move, write, character = classes.unbind(-1)
         blank, moves = self.num_classes[0] - 1, self.num_classes[1]
         logits = self.readout(self.hidden(classes[:, 0]).relu())
@@ -371,14 +331,11 @@ def make_tuple_policy(
     hidden_size: int = 128,
     window: int | None = None,
     tables: bool = False,
-    distinct_histories: bool = True,
-    device: torch.device | str | None = None,
-    dtype: torch.dtype | None = None,
 ) -> ProbabilisticActor:
     """Build the policy of the algorithmic tasks.
 
-    One-hot observation and previous action, an LSTM or a window of the last steps with a hidden
-    layer (ReLU), a linear head, :class:`TupleCategorical`. It
+    One-hot observation and previous action, an LSTM (:class:`DistinctHistoryLSTM`) or a window of
+    the last steps with a hidden layer (ReLU), a linear head, :class:`TupleCategorical`. It
     reads `observation` (int64 `[*B]`, below `num_observations`), `previous_action` (int64 `[*B,
     3]`, below nvec + 1: the last class of each means that there is none yet) and `is_init` (of
     `torchrl.envs.InitTracker`), and writes `logits`, `action` (int64 `[*B, 3]`) and
@@ -392,11 +349,6 @@ def make_tuple_policy(
             (:class:`DistinctWindowNetwork`). Default None: the LSTM.
         tables: whether tables read what lies before the present step (:class:`TupleTables`).
             Default False: the hidden layer does.
-        distinct_histories: whether rows with equal histories are computed once
-            (:class:`DistinctHistoryLSTM`), or each row by :class:`torchrl.modules.LSTMModule`. The
-            numbers and the order of the parameters are the same.
-        device: of the parameters.
-        dtype: of the parameters.
 
     Returns:
         The actor. Its environment needs `InitTracker()` and, to sample, the state's primer. Both
@@ -430,34 +382,19 @@ def make_tuple_policy(
     nvec = check_counts("nvec", nvec)
     num_classes = [num_observations, *(n + 1 for n in nvec)]
     inputs: list[NestedKey] = ["observation", "previous_action"]
-    factory: dict[str, Any] = {"device": device, "dtype": dtype}
+    keys: dict[str, Any] = {"in_keys": inputs, "out_key": "logits"}
     core: Any
-    readout = nn.Linear(hidden_size, _num_logits(nvec), **factory)
-    if window is not None:
+    readout = nn.Linear(hidden_size, _num_logits(nvec))
+    if window is None:
+        core = DistinctHistoryLSTM(num_classes, hidden_size, readout, **keys)
+    else:
         network: nn.Module
         if check_flag("tables", tables):
-            network = TupleTables(num_classes, window, hidden_size, **factory)
+            network = TupleTables(num_classes, window, hidden_size)
         else:
             sizes = num_classes * check_count("window", window)
-            network = nn.Sequential(OneHotLinear(sizes, hidden_size, **factory), nn.ReLU(), readout)
-        core = DistinctWindowNetwork(num_classes, network, window, in_keys=inputs, out_key="logits")
-    elif check_flag("distinct_histories", distinct_histories):
-        core = DistinctHistoryLSTM(
-            num_classes,
-            hidden_size,
-            readout=readout,
-            in_keys=inputs,
-            out_key="logits",
-            **factory,
-        )
-    else:
-        lstm = nn.LSTM(sum(num_classes), hidden_size, batch_first=True, **factory)
-        modules: list[Any] = [
-            TensorDictModule(_OneHot(num_classes, dtype), in_keys=inputs, out_keys=["one_hot"]),
-            LSTMModule(lstm=lstm, in_key="one_hot", out_key="embed"),
-            TensorDictModule(readout, in_keys=["embed"], out_keys=["logits"]),
-        ]
-        core = TensorDictSequential(*modules)
+            network = nn.Sequential(OneHotLinear(sizes, hidden_size), nn.ReLU(), readout)
+        core = DistinctWindowNetwork(num_classes, network, window, **keys)
     return _TupleActor(
         core,
         in_keys=["logits"],
@@ -470,7 +407,7 @@ def make_tuple_policy(
 
 
 class TuplePolicy:
-    """What policies over a :class:`DistinctCore` share: distributions of each distinct past."""
+    """What policies over a ``DistinctCore`` share: distributions of each distinct past."""
 
     _known: TupleCategorical | None = None
 
@@ -483,7 +420,7 @@ class TuplePolicy:
     def constant_weights(self) -> Iterator[None]:
         """Within, the weights do not change: what depends on them alone is computed once."""
         core, options = self.parts
-        with core.constant_weights() if isinstance(core, DistinctCore) else nullcontext() as logits:
+        with core.constant_weights() as logits:
             if logits is not None:
                 self._known = TupleCategorical(logits, **options)
             try:
@@ -519,7 +456,7 @@ class _TupleActor(TuplePolicy, ProbabilisticActor):
 
     def get_dist(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> Any:
         """The distribution of the actions; see the base class."""
-        if args or kwargs or not isinstance(self.parts[0], DistinctCore):
+        if args or kwargs:
             return super().get_dist(tensordict, *args, **kwargs)
         return self.read(tensordict)[0]
 
@@ -529,7 +466,6 @@ class _TupleActor(TuplePolicy, ProbabilisticActor):
         core, head = modules
         kind = exploration_type() or head.default_interaction_type
         usual = len(args) == 1 and isinstance(args[0], TensorDictBase) and not kwargs
-        usual = usual and isinstance(core, DistinctCore)
         selected = self.out_keys != self.all_out_keys
         if not usual or kind is not ExplorationType.RANDOM or selected:
             return super().forward(*args, **kwargs)
@@ -537,23 +473,3 @@ class _TupleActor(TuplePolicy, ProbabilisticActor):
         action, log_prob = distribution.sample_and_log_prob()
         tensordict = core.write(args[0], read)
         return tensordict.set("action", action).set("action_log_prob", log_prob)
-
-
-class _OneHot(nn.Module):
-    """One-hot vectors of the inputs, concatenated.
-
-    Args:
-        num_classes: the number of classes of the observation and of each part of the action.
-        dtype: of the vectors. Default None: PyTorch's default.
-    """
-
-    def __init__(self, num_classes: Sequence[int], dtype: torch.dtype | None = None) -> None:
-        super().__init__()
-        self.num_classes = tuple(num_classes)
-        self.dtype = dtype or torch.get_default_dtype()
-
-    def forward(self, observation: Tensor, previous_action: Tensor) -> Tensor:
-        """Encode observations `[*B]` and actions `[*B, d]`: `[*B, sum(num_classes)]`."""
-        columns = [observation, *previous_action.unbind(-1)]
-        hots = [F.one_hot(x, n) for x, n in zip(columns, self.num_classes, strict=True)]
-        return torch.cat(hots, -1).to(self.dtype)

@@ -168,8 +168,6 @@ class OneHotLinear(nn.Linear):
     Args:
         num_classes: the number of classes of each integer.
         out_features: H.
-        device: of the parameters.
-        dtype: of the parameters.
 
     Raises:
         TypeError: if `num_classes` is no sequence.
@@ -185,28 +183,13 @@ class OneHotLinear(nn.Linear):
 
     offsets: Tensor
 
-    def __init__(
-        self,
-        num_classes: Sequence[int],
-        out_features: int,
-        device: torch.device | str | None = None,
-        dtype: torch.dtype | None = None,
-    ) -> None:
-        sizes = check_counts("num_classes", num_classes)
-        super().__init__(sum(sizes), out_features, device=device, dtype=dtype)
-        sizes = torch.tensor(sizes, device=device)
+    def __init__(self, num_classes: Sequence[int], out_features: int) -> None:
+        sizes = torch.tensor(check_counts("num_classes", num_classes))
+        super().__init__(int(sizes.sum()), out_features)
         self.register_buffer("offsets", sizes.cumsum(0) - sizes, persistent=False)
 
     def forward(self, classes: Tensor) -> Tensor:
-        """Apply it.
-
-        Args:
-            classes: int64 `[n, *]`, as many a row as there are in `num_classes`; -1 has the zero
-                vector.
-
-        Returns:
-            `[n, H]`.
-        """
+        """From int64 `[n, *]`, one of each of `num_classes`, to `[n, H]`; -1 is the zero vector."""
         classes = classes.flatten(1)
         hot = (classes + self.offsets).where(classes >= 0, self.in_features)
         columns = F.pad(self.weight.t(), (0, 0, 0, 1))  # the last one is of -1
