@@ -180,6 +180,12 @@ def when(path: str) -> float:
     return median(steps) if len(steps) else np.inf
 
 
+def solved_by_task(study: str, name: str) -> list[list[float]]:
+    """Of each task of a study: how many runs of a cell solve it, and when; 0 where none does."""
+    paths = [f"{study}/{task}/{name}" for task in manifest().studies[study].tasks]
+    return [[solved(path)[0], when(path)] if solved(path)[0] else [0] for path in paths]
+
+
 def lost(path: str) -> int:
     """How many runs solve the task and end below its threshold."""
     is_below = last(path) < (cell(path).cell.task.solved or 0)
