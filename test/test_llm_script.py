@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import csv
-import importlib
 import re
-import sys
+from functools import partial
 from pathlib import Path
 from random import Random
 
@@ -25,18 +24,12 @@ TINY = (
     *("num_prompts=2", "group_size=3", "evaluation.prompts=2", "evaluation.completions=64"),
     *("evaluation.interval=1", "total_completions=12"),
 )
-MODULES = ("comparison", "tasks", "utils")
 
 
 @pytest.fixture
-def modules(monkeypatch):
-    """Imports what is beside the script, as if it were started from there."""
-    monkeypatch.syspath_prepend(str(SCRIPT.parent))
-    for name in MODULES:
-        sys.modules.pop(name, None)
-    yield importlib.import_module
-    for name in MODULES:
-        sys.modules.pop(name, None)
+def modules(beside):
+    """Imports what is beside the script."""
+    return partial(beside, "llm")
 
 
 def run_llm(directory, *options, script=SCRIPT):
