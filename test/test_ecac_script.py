@@ -15,6 +15,7 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 import torch
+from gymnasium.envs.classic_control import PendulumEnv
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from PIL import Image
@@ -221,7 +222,11 @@ def test_without_entropy_is_one_option(utils, build):
     torch.testing.assert_close(*losses)
 
 
-def test_play_shows_what_a_run_has_learned(tmp_path, beside_ecac, train, capsys):
+def test_play_shows_what_a_run_has_learned(tmp_path, beside_ecac, train, capsys, monkeypatch):
+    # A hundredth of the pixels, which take most of the time.
+    monkeypatch.setattr(
+        PendulumEnv, "screen_dim", property(lambda _: 50, lambda *_: None), raising=False
+    )
     train(tmp_path, "loss=sac")
     capsys.readouterr()
     beside_ecac("play").main([str(tmp_path), "--episodes", "2"])
