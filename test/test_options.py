@@ -268,10 +268,6 @@ def test_all_that_does_not_go_together_is_said(refusal):
         ("env=algorithmic", "Could not find 'env/algorithmic' Available options in 'env': bandit"),
         ("ecac env=gym", "ecac.py: env.name must be given.\n"),
         ("resume=nowhere", "ecpo.py: resume=nowhere: there is no such directory.\n"),
-        (
-            "collector=multi_sync",
-            "ecpo.py: num_groups=1 must be a multiple of the number of workers",
-        ),
     ],
 )
 def test_a_refusal_is_one_line(refusal, options, message):
@@ -287,6 +283,11 @@ def test_a_refusal_is_one_line(refusal, options, message):
         ("compile=true seeds=[0,1]", "ecpo.py: compile=true is for single runs"),
         ("env=copy policy=gru", "Could not find 'policy/gru' Available options in 'policy': lstm"),
         ("ecac --multirun gamma=0,2", "ecac.py: gamma must be a number >= 0 and <= 1, got 2."),
+        # When the run has begun.
+        (
+            "collector=multi_sync",
+            "ecpo.py: num_groups=1 must be a multiple of the number of workers",
+        ),
     ],
 )
 def test_a_script_says_so_in_one_line_and_makes_no_directory(tmp_path, options, message):
