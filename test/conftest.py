@@ -53,7 +53,7 @@ def torchrl_configs(monkeypatch):
 def forget_scripts():
     """Modules of the scripts have the same names in several folders."""
     for name, module in sys.modules.copy().items():
-        if str(getattr(module, "__file__", None)).startswith(str(SCRIPTS)):
+        if str(vars(module).get("__file__")).startswith(str(SCRIPTS)):
             del sys.modules[name]
 
 
@@ -96,4 +96,4 @@ def run_here(beside, monkeypatch):
 @pytest.fixture
 def forked_workers(monkeypatch):
     """Worker processes start from one that has imported torch, and not afresh: in no time."""
-    monkeypatch.setattr(multiprocessing, "get_context", lambda method: FORKED)
+    monkeypatch.setattr(multiprocessing, "get_context", lambda method=None: FORKED)

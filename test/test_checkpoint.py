@@ -45,7 +45,7 @@ CONTROL = (
 ECAC_STATES = "loss.num_actor_states=8"
 RUNS = {
     "bandit": BANDIT,
-    "copy": ("ecpo", "env=copy", "total_trajectories=128", "project_steps=2", *ALGORITHMIC),
+    "copy": ("ecpo", "env=copy", "total_trajectories=192", "project_steps=2", *ALGORITHMIC),
     "cartpole": (
         *("ecpo", "env=gym", "total_trajectories=96", "env.max_steps=20"),
         *("num_groups=2", "group_size=8", "evaluation.interval=2"),

@@ -22,7 +22,7 @@ from torchrl_ecpo.modules.histories import distinct_histories, hash_histories
 BANDIT = ("env=bandit", "env.num_actions=50", "group_size=10", "total_trajectories=600")
 COPY = (
     *("env=copy", "policy.hidden_size=16", "num_groups=4", "group_size=5", "project_steps=2"),
-    *("total_trajectories=320", "evaluation.interval=10", "optim.max_grad_norm=0.5"),
+    *("total_trajectories=320", "evaluation.interval=13", "optim.max_grad_norm=0.5"),
     "anneal_from={metric:return,at_least:-0.12}",
 )
 PAPER = (*COPY, "form=paper")
