@@ -48,8 +48,9 @@ report: install ## write docs/study.md from committed results; RUNS=runs/study t
 	$(if $(RUNS),$(RUN) sota-implementations/study/collect.py $(RUNS))
 	$(RUN) sota-implementations/study/report.py
 
+# By file: what the tests of a file share is made once.
 test: install ## run every test that takes less than some ten seconds
-	$(RUN) -m pytest -n auto -q
+	$(RUN) -m pytest -n auto --dist loadfile -q
 
 test-slow: install ## run the tests that take longer
 	$(RUN) -m pytest -n auto -q -m slow

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import csv
-import importlib
 import io
 import os
 import pickle
 import shlex
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -18,10 +16,9 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
-from processes import run_script
+from processes import run_script, start_script
 from tensordict import NonTensorData, TensorDict
 from torchrl.checkpoint import Checkpoint, CheckpointError
 from torchrl.envs import DMControlEnv, GymEnv, TransformedEnv
@@ -32,13 +29,12 @@ from torchrl_ecpo.experiment import Checkpoints, Progress, Run
 from torchrl_ecpo.experiment._files import check_files, read_manifest, seal
 from torchrl_ecpo.experiment.checkpoint import _differences, run_directory
 
-SCRIPT_MODULES = ("utils", "tasks", "stack", "score_sac", "ecpo", "ecac")
 SCRIPTS = Path(__file__).parents[1] / "sota-implementations"
 BANDIT = ("ecpo", "env=bandit", "env.num_actions=20", "total_trajectories=60", "group_size=5")
 ALGORITHMIC = ("num_groups=2", "group_size=8", "policy.hidden_size=8", "evaluation.interval=2")
 CONTROL = (
     "ecac",
-    "total_frames=240",
+    "total_frames=200",
     "log_interval=40",
     "evaluation.interval=80",
     "evaluation.episodes=1",
@@ -63,17 +59,10 @@ RUNS = {
 
 
 @pytest.fixture
-def start(monkeypatch):
+def start(run_here, monkeypatch):
     """Runs a script in this process, in a directory: up to a boundary, or to its end."""
-    monkeypatch.setattr("torchrl_ecpo.experiment.run.plot_learning_curve", lambda *_, **__: "")
 
     def start(directory, script, *options, stop_at=None, kill_at=None, save_at=None):
-        for name in SCRIPT_MODULES:
-            sys.modules.pop(name, None)
-        monkeypatch.syspath_prepend(str(SCRIPTS / script))
-        main = importlib.import_module(script).main
-        with initialize_config_dir(str(SCRIPTS / script / "config"), version_base="1.3"):
-            config = compose("config", ["checkpoint.interval=null", *options])
         boundary, count = Checkpoints.boundary, 0
 
         def counted(checkpoints):
@@ -87,15 +76,11 @@ def start(monkeypatch):
                 raise Killed
             boundary(checkpoints)
 
-        directory.mkdir(exist_ok=True)
-        monkeypatch.chdir(directory)
         with monkeypatch.context() as patch:
             patch.setattr(Checkpoints, "boundary", counted)
-            main.__wrapped__(config)
+            run_here(directory, script, *options)
 
-    yield start
-    for name in SCRIPT_MODULES:
-        sys.modules.pop(name, None)
+    return start
 
 
 class Killed(Exception):
@@ -141,7 +126,8 @@ def test_a_resumed_run_equals_one_that_was_never_stopped(tmp_path, start, capfd,
     with pytest.raises(SystemExit) as stop:
         start(parts, *run, stop_at=first)
     assert stop.value.code == 128 + signal.SIGTERM
-    command = shlex.join(["python", *sys.argv, f"resume={parts}"])
+    typed = ("checkpoint.interval=null", *run[1:])
+    command = shlex.join(["python", sys.argv[0], *typed, f"resume={parts}"])
     assert f"Resume with: {command}" in capfd.readouterr().out
     with pytest.raises(Killed):
         start(parts, *run, f"resume={parts}", save_at=1, kill_at=second - first + 1)
@@ -578,21 +564,18 @@ def test_where_a_run_goes(tmp_path, monkeypatch, resume, directory):
 
 
 def test_ctrl_c_and_resume_auto_as_a_user_types_them(tmp_path):
-    command = [sys.executable, str(SCRIPTS / "ecpo/ecpo.py"), *RUNS["bandit"][1:3], "group_size=5"]
-    command += ["total_trajectories=2000000"]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
-        while not list(tmp_path.glob("runs/*/*/*/*/metrics.csv")):
-            assert process.poll() is None, "the run has ended before its first record"
-            time.sleep(0.05)
-        process.send_signal(signal.SIGINT)
-        assert process.stdout is not None
-        output = process.stdout.read()
-    assert process.returncode == 128 + signal.SIGINT
+    script, options = SCRIPTS / "ecpo/ecpo.py", (*RUNS["bandit"][1:3], "group_size=5")
+    process = start_script(tmp_path, script, *options, "total_trajectories=2000000")
+    while not list(tmp_path.glob("runs/*/*/*/*/metrics.csv")):
+        assert process.is_alive(), "the run has ended before its first record"
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGINT)
+    process.join()
+    assert process.exitcode == 128 + signal.SIGINT
     (directory,) = tmp_path.glob("runs/*/*/*/*")
-    options = " ".join(command[2:])
-    expected = f"Stopped by SIGINT. Resume with: python {command[1]} {options} resume={directory}"
-    assert expected in output
-    options = (*command[2:-1], "total_trajectories=60", "resume=auto")
-    other = run_script(tmp_path, SCRIPTS / "ecpo/ecpo.py", *options)
+    typed = f"python {script} {' '.join(options)} total_trajectories=2000000"
+    expected = f"Stopped by SIGINT. Resume with: {typed} resume={directory}"
+    assert expected in (tmp_path / ".stdout").read_text()
+    other = run_script(tmp_path, script, *options, "total_trajectories=60", "resume=auto")
     assert "total_trajectories was 2000000, is 60" in other.stderr
     assert list(tmp_path.glob("runs/*/*/*/*")) == [directory]

@@ -500,6 +500,7 @@ def test_state_dict_resumes_to_the_bit():
     assert batch["collector", "traj_ids"].max() > last["collector", "traj_ids"].max()
 
 
+@pytest.mark.usefixtures("forked_workers")
 @pytest.mark.parametrize("make", [Countdown(), [Countdown, Countdown]], ids=["here", "workers"])
 def test_random_actions_are_written_to_a_replay_buffer(make):
     sampler = TrajectoryGroupSampler(group_size=3, replacement=False)
@@ -586,7 +587,9 @@ for pickle in (cloudpickle, ray.cloudpickle):
 
 
 @pytest.mark.parametrize("sync", [True, False])
-def test_worker_processes(sync):
+def test_worker_processes(sync, request):
+    if not sync:
+        request.getfixturevalue("forked_workers")
     policy = moded_policy()
     policy.module.weight.data.zero_()
     collector = TrajectoryGroupCollector(
@@ -627,6 +630,7 @@ def test_worker_processes(sync):
     assert modes == [weight % 2 == 0 for weight in weights]
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_an_error_in_a_worker_process_is_raised_here():
     def fail():
         raise ZeroDivisionError("in the rules")

@@ -1,18 +1,21 @@
-"""The actor-critic script, started as a user would start it, and what it is built from."""
+"""The actor-critic script, started as a user would start it, and what it is built from.
+
+What does not depend on the command line is run in the process of the tests.
+"""
 
 from __future__ import annotations
 
-import importlib
 import itertools
 import json
 import math
 import re
-import sys
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
 import pytest
 import torch
+from gymnasium.envs.classic_control import PendulumEnv
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from PIL import Image
@@ -56,10 +59,26 @@ def configure(overrides):
         return compose("config", overrides)
 
 
-def run_ecac(directory, *overrides):
-    process = start(directory, *tiny(overrides), f"hydra.run.dir={directory}", *overrides)
-    assert process.returncode == 0, process.stderr
-    return read_metrics(directory)
+@pytest.fixture
+def beside_ecac(beside):
+    """Imports what is beside the script."""
+    return partial(beside, "ecac")
+
+
+@pytest.fixture
+def utils(beside_ecac):
+    return beside_ecac("utils")
+
+
+@pytest.fixture
+def train(run_here):
+    """Runs the script in this process, in a directory."""
+
+    def train(directory, *overrides):
+        run_here(directory, "ecac", *tiny(overrides), *overrides)
+        return read_metrics(directory)
+
+    return train
 
 
 def reproducible(metrics):
@@ -67,26 +86,34 @@ def reproducible(metrics):
     return {name: str(column) for name, column in metrics.items() if name != "steps_per_second"}
 
 
+SWEPT = ("ecac", "sac", "td3")
+
+
 @pytest.fixture(scope="module")
 def sweep(tmp_path_factory):
-    """Every loss, by one start of the script."""
+    """Some losses, by one start of the script."""
     directory = tmp_path_factory.mktemp("sweep")
-    process = start(
-        directory,
-        "--multirun",
-        f"loss={','.join(LOSSES)}",
-        "seed=3",
-        *TINY[:-1],
-        f"hydra.sweep.dir={directory}",
-        "hydra.sweep.subdir=${loss.name}",
-    )
+    where = (f"hydra.sweep.dir={directory}", "hydra.sweep.subdir=${loss.name}")
+    options = (f"loss={','.join(SWEPT)}", "seed=3", *TINY[:-1])
+    process = start(directory, "--multirun", *options, *where)
     assert process.returncode == 0, process.stderr
     return directory
 
 
-@pytest.mark.parametrize("loss", LOSSES)
-def test_every_loss_trains_on_pendulum(sweep, loss):
-    metrics = read_metrics(sweep / loss)
+@pytest.mark.parametrize("loss", SWEPT)
+def test_a_sweep_leaves_a_directory_for_each_run(sweep, loss):
+    check_run(read_metrics(sweep / loss))
+    assert json.loads((sweep / loss / "summary.json").read_text())["finished"] is True
+    assert OmegaConf.load(sweep / loss / "config.yaml").loss.name == loss
+    assert (sweep / loss / "curve.png").exists()
+
+
+@pytest.mark.parametrize("loss", [loss for loss in LOSSES if loss not in SWEPT])
+def test_every_other_loss_trains_on_pendulum(tmp_path, train, loss):
+    check_run(train(tmp_path, f"loss={loss}", "seed=3"))
+
+
+def check_run(metrics):
     assert metrics["step"] == [80, 160, 240]
     losses = [name for name in metrics if name.startswith("loss_")]
     assert len(losses) >= 2
@@ -97,9 +124,6 @@ def test_every_loss_trains_on_pendulum(sweep, loss):
     assert -2000 < metrics["evaluation_return"][1] < 0
     # The only episode that ended, after 200 steps; the time limit is none that bootstrapping sees.
     assert list(map(math.isnan, metrics["return"])) == [True, True, False]
-    assert json.loads((sweep / loss / "summary.json").read_text())["finished"] is True
-    assert OmegaConf.load(sweep / loss / "config.yaml").loss.name == loss
-    assert (sweep / loss / "curve.png").exists()
 
 
 def test_the_same_seed_gives_the_same_run_and_another_another(sweep, tmp_path):
@@ -126,8 +150,8 @@ def test_a_compiled_run_gives_the_metrics_of_a_run_that_is_not(sweep, tmp_path):
         assert metrics[name] == pytest.approx(expected[name], 1e-3, 1e-5, nan_ok=True), name
 
 
-def test_evaluation_does_not_disturb_training(sweep, tmp_path):
-    often = run_ecac(tmp_path, "loss=td3", "seed=3", "evaluation.interval=80")
+def test_evaluation_does_not_disturb_training(sweep, tmp_path, train):
+    often = train(tmp_path, "loss=td3", "seed=3", "evaluation.interval=80")
     seldom = read_metrics(sweep / "td3")
     for name in ("return", "loss_actor", "loss_qvalue"):
         assert str(often[name]) == str(seldom[name])
@@ -144,7 +168,6 @@ def test_evaluation_does_not_disturb_training(sweep, tmp_path):
             *("env=dm_control", "env.name=pendulum", "env.task=swingup"),
             *("loss=sac", "loss.width_entropy=0.4"),
         ),
-        pytest.param(("collector=multi_sync", "loss=sac"), marks=pytest.mark.slow),
         (
             *("loss.reference_interval=5", "loss.projection=paper"),
             *("loss.value_network=true", "loss.target_kl=null"),
@@ -153,10 +176,10 @@ def test_evaluation_does_not_disturb_training(sweep, tmp_path):
     ],
     ids=" ".join,
 )
-def test_tasks_collectors_and_ablations_run(tmp_path, options):
+def test_tasks_and_ablations_run(tmp_path, train, options):
     if "env=hopper" in options or "env=dm_control" in options:
         pytest.importorskip("mujoco")
-    metrics = run_ecac(tmp_path, *options)
+    metrics = train(tmp_path, *options)
     assert metrics["step"][-1] == 240
     assert math.isfinite(metrics["loss_actor"][-1])
     if any("schedule" in option for option in options):
@@ -164,10 +187,21 @@ def test_tasks_collectors_and_ablations_run(tmp_path, options):
         assert metrics["tau"][1:] == pytest.approx([0.15, 0.1], abs=0.01)
 
 
-def test_lengths_that_fit_no_interval_are_run_to_the_end(tmp_path):
+@pytest.mark.slow
+def test_workers_run(tmp_path):
+    process = start(
+        tmp_path, *TINY[:-1], f"hydra.run.dir={tmp_path}", "collector=multi_sync", "loss=sac"
+    )
+    assert process.returncode == 0, process.stderr
+    metrics = read_metrics(tmp_path)
+    assert metrics["step"][-1] == 240
+    assert math.isfinite(metrics["loss_actor"][-1])
+
+
+def test_lengths_that_fit_no_interval_are_run_to_the_end(tmp_path, train):
     """Rows are written when one is due, when the policy is evaluated, and at the end."""
     odd = ("total_frames=250", "log_interval=70", "evaluation.interval=100")
-    metrics = run_ecac(tmp_path, "loss=sac", *odd)
+    metrics = train(tmp_path, "loss=sac", *odd)
     assert metrics["step"] == [72, 104, 144, 200, 216, 256]  # in batches of 8
     evaluated = [x == x for x in metrics["evaluation_return"]]
     assert evaluated == [False, True, False, True, False, False]
@@ -188,9 +222,14 @@ def test_without_entropy_is_one_option(utils, build):
     torch.testing.assert_close(*losses)
 
 
-def test_play_shows_what_a_run_has_learned(tmp_path, utils, capsys):
-    run_ecac(tmp_path, "loss=sac")
-    importlib.import_module("play").main([str(tmp_path), "--episodes", "2"])
+def test_play_shows_what_a_run_has_learned(tmp_path, beside_ecac, train, capsys, monkeypatch):
+    # A hundredth of the pixels, which take most of the time.
+    monkeypatch.setattr(
+        PendulumEnv, "screen_dim", property(lambda _: 50, lambda *_: None), raising=False
+    )
+    train(tmp_path, "loss=sac")
+    capsys.readouterr()
+    beside_ecac("play").main([str(tmp_path), "--episodes", "2"])
     first, second, mean, drawn = capsys.readouterr().out.splitlines()
     returns = [
         float(line.removeprefix("return ").removesuffix(", 200 steps")) for line in (first, second)
@@ -201,26 +240,18 @@ def test_play_shows_what_a_run_has_learned(tmp_path, utils, capsys):
         assert video.n_frames > 100  # equal ones are shown for longer
 
 
-@pytest.mark.parametrize("loss", [None, "discrete_pmd_ac"])
-def test_one_discrete_action_has_a_loss_of_its_own(tmp_path, loss):
-    options = ["env=gym", "env.name=CartPole-v1"] + ([f"loss={loss}"] if loss else [])
-    process = start(tmp_path, *TINY[:-1], f"hydra.run.dir={tmp_path}", *options)
+CARTPOLE = ("env=gym", "env.name=CartPole-v1")
+
+
+def test_one_discrete_action_has_a_loss_of_its_own(tmp_path, train):
+    process = start(tmp_path, *TINY[:-1], f"hydra.run.dir={tmp_path}", *CARTPOLE)
     assert process.returncode == 0, process.stderr
-    assert OmegaConf.load(tmp_path / "config.yaml").loss.name == (loss or "discrete_ecac")
-    metrics = read_metrics(tmp_path)
-    assert metrics["step"][-1] == 240
-    assert all(map(math.isfinite, metrics["loss_actor"][1:]))
-    assert 0.6 < metrics["entropy"][-1] <= math.log(2) + 1e-6
-
-
-@pytest.fixture
-def utils(monkeypatch):
-    monkeypatch.syspath_prepend(str(SCRIPT))
-    import utils
-
-    yield utils
-    for name in ("utils", "ecac", "choice", "play"):
-        sys.modules.pop(name, None)
+    assert OmegaConf.load(tmp_path / "config.yaml").loss.name == "discrete_ecac"
+    other = train(tmp_path / "pmd", *CARTPOLE, "loss=discrete_pmd_ac")
+    for metrics in (read_metrics(tmp_path), other):
+        assert metrics["step"][-1] == 240
+        assert all(map(math.isfinite, metrics["loss_actor"][1:]))
+        assert 0.6 < metrics["entropy"][-1] <= math.log(2) + 1e-6
 
 
 @pytest.mark.parametrize(
@@ -253,8 +284,8 @@ def test_bad_options_end_with_a_clear_message(utils, overrides, message):
         ("env=pendulum", []),
     ],
 )
-def test_the_loss_is_that_of_the_actions_unless_it_is_given(utils, options, expected):
-    assert importlib.import_module("choice").chosen_loss(options.split()) == expected
+def test_the_loss_is_that_of_the_actions_unless_it_is_given(beside_ecac, options, expected):
+    assert beside_ecac("choice").chosen_loss(options.split()) == expected
 
 
 def test_pixels_are_read_by_networks_of_convolutions(utils, monkeypatch):

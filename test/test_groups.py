@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import multiprocessing
 import pickle
 import random
 import re
@@ -9,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from processes import FORKED
 from tensordict import NonTensorData, NonTensorStack, TensorDict, assert_close
 from torchrl.data import (
     LazyMemmapStorage,
@@ -399,9 +399,8 @@ class TestSampler:
         buffer = TensorDictReplayBuffer(storage=storage, sampler=sampler, batch_size=2)
         buffer.extend(make_steps([(0, 3), (0, 3), (1, 4), (1, 4)]))
         assert drawn_groups(buffer) == {0, 1}
-        process = multiprocessing.get_context("spawn").Process(
-            target=buffer.extend, args=(make_steps([(2, 4), (2, 4)], first_id=9),)
-        )
+        steps = make_steps([(2, 4), (2, 4)], first_id=9)
+        process = FORKED.Process(target=buffer.extend, args=(steps,))
         process.start()
         process.join()
         assert process.exitcode == 0

@@ -234,12 +234,46 @@ def test_hydra_s_own_flags_are_its_own(monkeypatch, options):
     check_command_line(str(SCRIPTS / "ecpo/ecpo.py"), lambda config, given: None)
 
 
-def test_all_that_does_not_go_together_is_said(tmp_path):
-    given = ("compile=true", "env=bandit", "+policy=window", "seeds=[0,1]")
-    process = run_script(tmp_path, SCRIPTS / "ecpo/ecpo.py", *given)
+@pytest.fixture
+def refusal(beside, monkeypatch):
+    """What a script says of options before it begins."""
+
+    def refusal(options):
+        script, given = split(options)
+        module = beside(script, script)
+        monkeypatch.setattr(sys, "argv", [f"{script}.py", *given])
+        check = module.check_config if script == "ecac" else module.check_runs
+        with pytest.raises(SystemExit) as refused:
+            check_command_line(str(SCRIPTS / script / f"{script}.py"), check)
+        return f"{refused.value}\n"
+
+    return refusal
+
+
+def test_all_that_does_not_go_together_is_said(refusal):
     said = ("compile=true is for single runs", "policy= is for the algorithmic tasks")
-    lines = process.stderr.splitlines()
+    lines = refusal("compile=true env=bandit +policy=window seeds=[0,1]").splitlines()
     assert all(line.startswith(f"ecpo.py: {one}") for line, one in zip(lines, said, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("compile=true env=copy", "compile=true is for tasks of the kinds ('bandit', 'gym')"),
+        ("stack=['seed=0','loss.tua=1']", "ecpo.py: There is no option loss.tua"),
+        ("form=book", "Could not find 'form/book' Available options in 'form': paper recipe"),
+        ("policy=lstm", "ecpo.py: Could not override 'policy'. No match in the defaults list.\n"),
+        ("+policy=lstm", "ecpo.py: policy= is for the algorithmic tasks and env=popgym, got"),
+        ("env=popgym policy=tables", "ecpo.py: policy.tables=true is for the algorithmic tasks"),
+        ("env=algorithmic", "Could not find 'env/algorithmic' Available options in 'env': bandit"),
+        ("ecac env=gym", "ecac.py: env.name must be given.\n"),
+        ("resume=nowhere", "ecpo.py: resume=nowhere: there is no such directory.\n"),
+    ],
+)
+def test_a_refusal_is_one_line(refusal, options, message):
+    said = refusal(options)
+    assert message in said
+    assert said.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -247,20 +281,9 @@ def test_all_that_does_not_go_together_is_said(tmp_path):
     [
         ("loss.control_variate=no", "ecpo.py: loss.control_variate must be true or false"),
         ("compile=true seeds=[0,1]", "ecpo.py: compile=true is for single runs"),
-        ("compile=true env=copy", "compile=true is for tasks of the kinds ('bandit', 'gym')"),
-        ("stack=['seed=0','loss.tua=1']", "ecpo.py: There is no option loss.tua"),
         ("env=copy policy=gru", "Could not find 'policy/gru' Available options in 'policy': lstm"),
-        ("form=book", "Could not find 'form/book' Available options in 'form': paper recipe"),
-        ("policy=lstm", "ecpo.py: Could not override 'policy'. No match in the defaults list.\n"),
-        ("+policy=lstm", "ecpo.py: policy= is for the algorithmic tasks and env=popgym, got"),
-        (
-            "env=popgym policy=tables",
-            "ecpo.py: policy.tables=true is for the algorithmic tasks",
-        ),
         ("ecac --multirun gamma=0,2", "ecac.py: gamma must be a number >= 0 and <= 1, got 2."),
-        ("env=algorithmic", "Could not find 'env/algorithmic' Available options in 'env': bandit"),
-        ("ecac env=gym", "ecac.py: env.name must be given.\n"),
-        ("resume=nowhere", "ecpo.py: resume=nowhere: there is no such directory.\n"),
+        # When the run has begun.
         (
             "collector=multi_sync",
             "ecpo.py: num_groups=1 must be a multiple of the number of workers",

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
 import json
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,13 +14,6 @@ from torchrl_ecpo.experiment import read_metrics
 
 pytest.importorskip("sb3_contrib")
 PPO = Path(__file__).parents[1] / "sota-implementations/sb3/ppo.py"
-
-
-@pytest.fixture
-def ppo(monkeypatch):
-    monkeypatch.syspath_prepend(str(PPO.parent))
-    yield importlib.import_module("ppo")
-    sys.modules.pop("ppo", None)
 
 
 def run_ppo(directory, *options):
@@ -52,7 +43,8 @@ def test_a_run_without_entropy_ends_where_it_is_asked_to(tmp_path):
     assert min(len(metrics["entropy"]), 3) == 2 or metrics["entropy"][-3] >= 0.1
 
 
-def test_the_deep_sea_is_the_one_of_the_groups(ppo):
+def test_the_deep_sea_is_the_one_of_the_groups(beside):
+    ppo = beside("sb3", "ppo")
     own, groups = ppo.DeepSea(4, instance_seed=3), DeepSeaEnv(4, instance_seed=3, group_size=20)
     torch.manual_seed(0)
     rollout = groups.rollout(4)

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import signal
-import sys
-from pathlib import Path
+from functools import partial
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from tensordict import TensorDict
@@ -23,12 +19,10 @@ from torchrl_ecpo.experiment import Checkpoints, Run, read_metrics
 from torchrl_ecpo.modules import TupleCategorical, make_softmax_policy, make_tuple_policy
 from torchrl_ecpo.modules.histories import distinct_histories, hash_histories
 
-SCRIPT = Path(__file__).parents[1] / "sota-implementations/ecpo"
-MODULES = ("utils", "tasks", "stacked", "ecpo", "play")
 BANDIT = ("env=bandit", "env.num_actions=50", "group_size=10", "total_trajectories=600")
 COPY = (
     *("env=copy", "policy.hidden_size=16", "num_groups=4", "group_size=5", "project_steps=2"),
-    *("total_trajectories=600", "evaluation.interval=20", "optim.max_grad_norm=0.5"),
+    *("total_trajectories=320", "evaluation.interval=13", "optim.max_grad_norm=0.5"),
     "anneal_from={metric:return,at_least:-0.12}",
 )
 PAPER = (*COPY, "form=paper")
@@ -41,19 +35,14 @@ SEEDS = (3, 11)
 
 
 @pytest.fixture
-def script(monkeypatch):
-    """The folder of the script, as if it were started from there."""
-    monkeypatch.syspath_prepend(str(SCRIPT))
-    yield importlib.import_module
-    for name in [name for name in sys.modules if name.split(".")[0] in MODULES]:
-        del sys.modules[name]
+def script(beside):
+    """Imports what is beside the script."""
+    return partial(beside, "ecpo")
 
 
 @pytest.fixture
-def train(script, monkeypatch):
+def train(run_here, monkeypatch):
     """Runs the script in this process, in a directory; until SIGTERM if `stop_at` says when."""
-    monkeypatch.setattr("torchrl_ecpo.experiment.run.plot_learning_curve", lambda *_, **__: "")
-    main = script("ecpo").main.__wrapped__.__wrapped__  # of hydra, and of what tidies up
     boundary = Checkpoints.boundary
 
     def train(directory, *options, stop_at=None):
@@ -62,17 +51,10 @@ def train(script, monkeypatch):
                 os.kill(os.getpid(), signal.SIGTERM)
             boundary(checkpoints)
 
-        directory.mkdir(exist_ok=True)
-        monkeypatch.chdir(directory)
         monkeypatch.setattr(Checkpoints, "boundary", stop)
-        options = ["checkpoint.interval=null", *options]
-        with initialize_config_dir(str(SCRIPT / "config"), version_base="1.3"):
-            whole = compose("config", options, return_hydra_config=True)
-            HydraConfig.instance().set_config(whole)
-            main(OmegaConf.masked_copy(whole, [key for key in whole if key != "hydra"]))
+        run_here(directory, "ecpo", *options, bare=True)
 
-    yield train
-    HydraConfig.instance().cfg = None
+    return train
 
 
 def assert_same_curves(actual, expected):
@@ -105,7 +87,7 @@ def test_stacked_runs_have_the_curves_of_single_ones(tmp_path, train, options):
         single, stacked = tmp_path / str(seed), tmp_path / f"stack/seed_{seed}"
         train(single, *options, f"seed={seed}")
         metrics = read_metrics(single)
-        assert len(metrics["step"]) == 30
+        assert len(metrics["step"]) == 16
         assert sum(x == x for x in metrics["pass_at_10"]) == 1
         assert_same_curves(stacked, single)
         # A directory like that of a single run, but for the checkpoints, which are the stack's.
@@ -125,7 +107,7 @@ SETTINGS = {
         (
             "loss=ecpo loss.tau=0.25,1.0 seed=3",
             "loss=urex seed=4 env.curriculum=group optim.lr=0.003 optim.amsgrad=false",
-            "loss=ment seed=3 project_steps=1 anneal_from=null evaluation.interval=30",
+            "loss=ment seed=3 project_steps=1 anneal_from=null evaluation.interval=15",
             "loss=reps seed=4",
         ),
     ),

@@ -213,7 +213,7 @@ def sweep(subject: Subject) -> tuple[int, int]:
     """Spoil each entry in every way, one at a time: how many are refused, and how many right."""
     counts = {"refused": 0, "right": 0}
     wrong = []
-    _result(subject, {})  # good input is right
+    good = _result(subject, {})
     unused = set(subject.fine)
     for entry, value in subject.entries.items():
         faults = list(subject.faults.get(entry) or faults_of(value))
@@ -225,7 +225,8 @@ def sweep(subject: Subject) -> tuple[int, int]:
             faults.append(Fault("missing", MISSING))
         for fault in faults:
             unused.discard((entry, fault.name))
-            verdict = _judge(subject, entry, fault)
+            expected = good if fault.meant is value else None
+            verdict = _judge(subject, entry, fault, expected)
             if verdict in counts:
                 counts[verdict] += 1
             elif verdict != "impossible":
@@ -235,7 +236,8 @@ def sweep(subject: Subject) -> tuple[int, int]:
     return counts["refused"], counts["right"]
 
 
-def _judge(subject: Subject, entry: Any, fault: Fault) -> str:
+def _judge(subject: Subject, entry: Any, fault: Fault, expected: list[Tensor] | None) -> str:
+    """What becomes of a fault; `expected` of what it means, where that is known already."""
     try:
         found = _result(subject, {entry: fault.bad})
     except Impossible:
@@ -251,7 +253,8 @@ def _judge(subject: Subject, entry: Any, fault: Fault) -> str:
         return "right"
     if fault.meant is None:
         return "accepted"
-    expected = _result(subject, {entry: fault.meant})
+    if expected is None:
+        expected = _result(subject, {entry: fault.meant})
     same = len(found) == len(expected) and all(
         x.numel() == y.numel()
         and torch.allclose(x.reshape(-1).double(), y.reshape(-1).double(), 1e-4, 1e-6)

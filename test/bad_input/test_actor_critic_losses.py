@@ -13,6 +13,9 @@ from faults import NO_NETWORKS, Subject, check, tensordict_of
 from torchrl_ecpo import ActorCriticLoss, PolyakAverage
 
 OPTIONS = {
+    "tau": 0.75,
+    "tau_prime": 0.25,
+    "gamma": 0.9,
     "num_qvalue_nets": 2,
     "num_action_samples": 4,
     "num_next_action_samples": 1,
@@ -30,18 +33,17 @@ OPTIONS = {
 }
 
 NETWORKS = ("actor_network", "qvalue_network")
-WHOLE = ("ecac", "discrete_ecac", "discrete_pmd_ac")
+WHOLE = ("ecac", "discrete_ecac")
 """Of these the networks and the batch are spoilt too, which the base reads for all: with actions
-that are vectors, numbers, and one-hot."""
+that are vectors and numbers. DiscretePMDACLoss is given one-hot actions."""
 
 
-def accepted(loss):
-    """The options of a loss, and of its bases."""
-    names = set()
-    for kind in loss.__mro__:
-        if issubclass(kind, ActorCriticLoss):
-            names |= inspect.signature(kind.__init__).parameters.keys()
-    return names
+def spoilt_options(name):
+    """Those of the loss's own constructor; the base's, which it hands on, are spoilt of ECAC."""
+    names = {*inspect.signature(CASES[name].loss.__init__).parameters}
+    if name == "ecac":
+        names |= {*inspect.signature(ActorCriticLoss.__init__).parameters, "gamma"}
+    return {key: x for key, x in OPTIONS.items() if key in names and x is not None}
 
 
 def batch(case):
@@ -54,7 +56,7 @@ def batch(case):
 
 
 def call(case, entries):
-    names = [name for name in entries if name in OPTIONS or name in ("tau", "tau_prime", "gamma")]
+    names = [name for name in entries if name in OPTIONS]
     options = {name: entries[name] for name in names}
     gamma = {"gamma": options.pop("gamma")} if "gamma" in options else {}
     networks = {network: entries[network]() for network in NETWORKS if network in entries}
@@ -75,18 +77,21 @@ def call(case, entries):
 
 @pytest.mark.parametrize("name", CASES)
 def test_actor_critic_losses(name):
-    case = CASES[name]
-    options = {key: x for key, x in OPTIONS.items() if key in accepted(case.loss) and x is not None}
-    options |= {"tau": 0.75, "tau_prime": 0.25, "gamma": 0.9}
+    case, spoilt = CASES[name], spoilt_options(name)
     others, networks = batch(case), make_networks(case.kind)
     others["actor_network"] = lambda: deepcopy(networks.actor)
     others["qvalue_network"] = lambda: deepcopy(networks.qvalues[0])
-    is_whole = name in WHOLE
+    is_one_hot = case.kind == "one_hot"
+    if name in WHOLE:
+        spoilt, others = spoilt | others, {}
+    elif is_one_hot:
+        spoilt["action"] = others.pop("action")
     subject = Subject(
-        lambda entries: call(case, {**others, **entries} if not is_whole else entries),
-        options | others if is_whole else options,
+        lambda entries: call(case, {**others, **entries}),
+        spoilt,
         faults=dict.fromkeys(NETWORKS, NO_NETWORKS),
-        fine={("action", "flags"): "one-hot"} if case.kind == "one_hot" else {},
-        optional=[*options, "priority_weight", ("collector", "mask")],
+        fine={("action", "flags"): "one-hot"} if is_one_hot else {},
+        optional=[*OPTIONS, "priority_weight", ("collector", "mask")],
     )
-    check(f"`{case.loss.__name__}`" + (", options" if not is_whole else ""), subject)
+    what = "" if name in WHOLE else ", options and one-hot actions" if is_one_hot else ", options"
+    check(f"`{case.loss.__name__}`{what}", subject)

@@ -267,14 +267,6 @@ def test_groups_over_several_discrete_actions(categorical, width):
     assert (played["observation"] == played["observation"][:, :1]).all()
 
 
-@each_way
-@pytest.mark.parametrize("seed", [-1, 1.5, "a"])
-def test_what_is_no_seed_is_refused(make, seed):
-    env = make_grouped_env(make, num_groups=1, group_size=2)
-    with pytest.raises(ValueError, match="seed must be an integer of at least 0, got"):
-        env.set_seed(seed)
-
-
 @pytest.mark.parametrize(
     ("make", "other"),
     [

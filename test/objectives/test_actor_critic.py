@@ -1007,23 +1007,6 @@ def test_learned_temperatures_stop_at_their_floor(name, option, far_above, far_b
                 assert (gradient > 0) == (start > floor)
 
 
-@losses
-def test_learned_temperatures_settle_where_the_constraints_hold(case):
-    """Gradient descent on the loss of tau alone, with the networks as they are."""
-    size = 1 if case.is_discrete else ACTION
-    networks = make_networks(case.kind)
-    for qvalue in networks.qvalues:
-        for parameter in qvalue.parameters():
-            parameter.data.mul_(2.0)
-    options = {} if case.is_discrete else {"num_action_samples": 32}
-    loss = case.build(networks, target_kl=0.05 / size, **options)
-    batch = _batch(case, 64)
-    for step in range(60):
-        gradient = gradients(loss, call(loss, batch)["loss_tau"])["log_tau"]
-        loss.log_tau.data.sub_(0.5 * 0.95**step * gradient)
-    assert call(loss, batch)["kl_target_reference"].item() == pytest.approx(0.05, rel=1e-2)
-
-
 # --------------------------------------------------------------------------------------- bad input
 
 

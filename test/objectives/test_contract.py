@@ -34,8 +34,8 @@ from trajectory_problems import (
 
 ECPO = CASES["ecpo"]  # of which is asked what stands once in the base class
 losses = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-delayable = pytest.mark.parametrize("case", [CASES[n] for n in DELAYED], ids=DELAYED)
-kinds = pytest.mark.parametrize("kind", ["categorical", "composite", "lstm"])
+KINDS = ("categorical", "composite", "lstm")
+kinds = pytest.mark.parametrize("kind", KINDS)
 OUT_KEYS = [
     "loss_actor",
     "ESS",
@@ -192,11 +192,13 @@ def test_input_is_untouched(kind, shape):
 # -------------------------------------------------------------------------------------- the module
 
 
-@losses
-@kinds
-def test_every_parameter_gets_a_gradient_and_no_target_does(case, kind):
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [*((name, KINDS[0]) for name in CASES), *(("ecpo", kind) for kind in KINDS[1:])],
+)
+def test_every_parameter_gets_a_gradient_and_no_target_does(name, kind):
     """And nothing is listed twice."""
-    loss = build(case, kind)
+    loss = build(CASES[name], kind)
     move(loss.actor_network)
     loss(sample(make_actor(kind), 2, 3, 4))["loss_actor"].backward()
     names = [name for name, _ in loss.named_parameters()]
@@ -293,15 +295,14 @@ def test_schedule_by_assignment(case):
 # ------------------------------------------------------------------------------------- the targets
 
 
-@delayable
-def test_delay_flag(case):
+def test_delay_flag():
     """With it the target stays where it was, without it the target is the live policy.
 
     TorchRL warns of targets that no updater moves, and of nothing else.
     """
     batch = sample(make_actor(), 2, 3, 4)
     for delayed in (True, False):
-        loss = case.build(make_actor(), delay_actor=delayed)
+        loss = ECPO.build(make_actor(), delay_actor=delayed)
         if delayed:
             with pytest.warns(UserWarning, match="No target network updater has been associated"):
                 loss(batch)
@@ -314,10 +315,9 @@ def test_delay_flag(case):
         assert ("target_actor_network_params" in dict(loss.named_children())) is delayed
 
 
-@losses
-def test_no_targets(case):
+def test_no_targets():
     """Built, called, trained and copied in silence; a stock updater says there are no targets."""
-    loss = case.build(make_actor())
+    loss = ECPO.build(make_actor())
     deepcopy(loss)(sample(make_actor(), 2, 3, 4))["loss_actor"].backward()
     with pytest.raises(RuntimeError, match="not find any target param"):
         SoftUpdate(loss, eps=0.9)
@@ -377,7 +377,13 @@ def test_modes_inside_and_after():
 # ----------------------------------------------------------------------------------------- compile
 
 
-@losses
+COMPILED = ("ecpo", "grpo")  # of trajectories, of steps; equations compile in test_functional
+
+
+@pytest.mark.parametrize(
+    "name",
+    [name if name in COMPILED else pytest.param(name, marks=pytest.mark.slow) for name in CASES],
+)
 @pytest.mark.parametrize(
     "backend",
     [
@@ -387,9 +393,10 @@ def test_modes_inside_and_after():
     ],
 )
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
-def test_compile(case, backend):
+def test_compile(name, backend):
     """Same numbers and gradients, without a graph break, and one compilation for a whole run."""
     torch._dynamo.reset()
+    case = CASES[name]
     loss, batch = build(case), pad(sample(make_actor(), 2, 3, 4))
     compiled = torch.compile(loss, fullgraph=True, backend=backend)
     with torch._dynamo.config.patch(error_on_recompile=False):

@@ -23,7 +23,6 @@ from torch import nn
 from torch.distributions import Beta, Categorical, Independent, Normal, kl_divergence
 from torch.testing import assert_close
 from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
-from trajectory_problems import OBSERVATION
 
 from torchrl_ecpo import DiscreteECACLoss, ECACLoss, PeriodicCopy
 from torchrl_ecpo.functional import (
@@ -499,41 +498,6 @@ def test_discrete_gradient_is_policy_minus_target(tau, tau_prime):
         ).weights
         probability = networks.actor.get_dist(batch).probs.detach().movedim(-1, 0)
         assert_close(bias, (probability - target).sum(-1))
-
-
-@pytest.mark.parametrize("name", ["discrete_ecac", "discrete_pmd_ac"])
-def test_both_projections_arrive_at_the_lift(name):
-    """From a fixed reference, by gradient descent in a table."""
-    case = CASES[name]
-    kind = "categorical"
-    networks = make_networks(kind)
-    table = _Table([[0.5, -0.5, 0.1, 0.0]] * OBSERVATION)
-    networks.actor[0].module = table
-    loss = case.build(networks, updater=False, delay_actor=True, delay_qvalue=False)
-    PeriodicCopy(loss, "actor_network", interval=10_000)
-    batch = make_batch(kind)[:1]
-    target = lift_by_summation(
-        networks.actor, networks.qvalues, batch["observation"], tau=0.75, tau_prime=0.25
-    )
-    optimizer = torch.optim.LBFGS(
-        networks.actor.parameters(), max_iter=50, line_search_fn="strong_wolfe"
-    )
-
-    def closure():
-        optimizer.zero_grad()
-        value = loss(batch)["loss_actor"]
-        value.backward()
-        return value
-
-    optimizer.step(closure)
-    outputs = loss(batch)
-    policy = networks.actor.get_dist(batch)
-    assert_close(policy.probs[0].detach(), target.weights[:, 0], atol=1e-4, rtol=0)
-    assert_close(outputs["state_value"], target.value[0])
-    divergence = (target.weights * (target.weights.log() - target.reference)).sum()
-    assert_close(outputs["kl_target_reference"], divergence)
-    reverse = (target.reference.exp() * (target.reference - target.weights.log())).sum()
-    assert_close(outputs["kl_reference_policy"], reverse, atol=1e-4, rtol=0)
 
 
 def test_soft_values_of_a_tabular_problem_are_a_fixed_point():
