@@ -222,6 +222,14 @@ def test_without_entropy_is_one_option(utils, build):
     torch.testing.assert_close(*losses)
 
 
+@pytest.mark.parametrize("text", ["total_trajectories: 10", "total_completions: 10"])
+def test_play_refuses_runs_of_other_scripts(tmp_path, beside_ecac, capsys, text):
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(SystemExit):
+        beside_ecac("play").main([str(tmp_path)])
+    assert f"error: {tmp_path} is no run of ecac.py.\n" in capsys.readouterr().err
+
+
 def test_play_shows_what_a_run_has_learned(tmp_path, beside_ecac, train, capsys, monkeypatch):
     # A hundredth of the pixels, which take most of the time.
     monkeypatch.setattr(

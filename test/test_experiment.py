@@ -232,6 +232,20 @@ def test_compare_prints_a_table_and_writes_picture_and_curves(runs, capsys):
     assert lines[-1] == "urex,0,30,2"
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["nowhere"], "error: There is no run (a folder with metrics.csv) below nowhere.\n"),
+        (["--metric", "score"], "has no metric 'score'; it has ["),
+        (["--by", "loss.theta"], "has no entry 'loss.theta' to tell methods apart.\n"),
+    ],
+)
+def test_compare_says_in_a_line_what_it_cannot_do(runs, capsys, options, message):
+    with pytest.raises(SystemExit):
+        compare(options if len(options) == 1 else [str(runs), *options])
+    assert message in capsys.readouterr().err
+
+
 def test_a_curve_of_one_point_is_seen():
     panel = Figure().subplots()
     steps, values = np.array([5.0, 10.0]), np.array([[1.0, 2.0], [2.0, 3.0]])

@@ -148,7 +148,7 @@ def test_a_model_of_ones_own(modules, monkeypatch, tmp_path):
     saved = save_model(utils, tmp_path / "model")
     monkeypatch.chdir(tmp_path)
     config = compose_options(SCRIPT.parent, ["model.path=model"])
-    utils.check_model(config)
+    utils.check_run(config, utils.LOSSES)
     model, tokenizer = utils.make_model(config.model)
     torch.testing.assert_close(dict(model.named_parameters()), dict(saved.named_parameters()))
     assert model.generation_config.top_k == 0
@@ -160,6 +160,7 @@ def test_a_model_of_ones_own(modules, monkeypatch, tmp_path):
     [
         ("env=chess", "env must be countdown or sums, got 'chess'."),
         ("task=sums", r"task is called env\."),
+        ("loss=trl", "loss= is here ecpo or pmd or tpo or grpo, got trl"),
         ("group_size=1", "group_size must be an integer >= 2, got 1."),
         ("evaluation.completions=8", "evaluation.completions must be an integer >= 64, got 8."),
         ("model.path=nowhere", r"model.path=nowhere: it must be a directory with a model in \*."),
@@ -177,8 +178,9 @@ def test_what_is_wrong_is_named(modules, monkeypatch, tmp_path, options, message
         save_model(modules("utils"), directory, pad_token="<end>")
         if "no_tokenizer" in options:
             (directory / "tokenizer_config.json").unlink()
+    utils = modules("utils")
     with pytest.raises(ValueError, match=message):
-        modules("utils").check_model(compose_options(SCRIPT.parent, [options]))
+        utils.check_run(compose_options(SCRIPT.parent, [options]), utils.LOSSES)
 
 
 def test_runs_of_the_comparison_are_those_of_its_cells_still(study):

@@ -54,6 +54,10 @@ def split(options):
             "optim.lr must be a number > 0, got 'fast'.\n"
             "There is no option loss.tua; the nearest one is loss.tau.$",
         ),
+        (
+            "ecac env=ants loss=ecpo gama=1",
+            "^There is no env=ants; .*\nThere is no loss=ecpo; there",
+        ),
         ("ecac env=gym loss.tua=1", "^env.name must be given.\nThere is no option loss.tua;"),
         # Numbers with an exponent are integers, if they are.
         ("num_groups=1.5e0", "num_groups must be an integer >= 1, got 1.5."),
@@ -210,7 +214,7 @@ def test_hydra_s_own_refusals_stand():
     [
         ("seed=0,1 loss.tau=0.1,fast --multirun", "ecpo.py: loss.tau must be .* got 'fast'"),
         ("-m loss=ecpo,rloo loss.control_variate=true", "no option loss.control_variate"),
-        ("-cn config env=chess", "Could not find 'env/chess'"),
+        ("-cn config env=chess", "There is no env=chess; there are bandit, copy, deep_sea,"),
         ("--multirun seed=1,2", "ecpo.py: seed 2 is refused"),
         ("--multirun loss=glob(r*) seed=2", "ecpo.py: loss reps is refused"),
     ],
@@ -261,12 +265,15 @@ def test_all_that_does_not_go_together_is_said(refusal):
     [
         ("compile=true env=copy", "compile=true is for tasks of the kinds ('bandit', 'gym')"),
         ("stack=['seed=0','loss.tua=1']", "ecpo.py: There is no option loss.tua"),
-        ("form=book", "Could not find 'form/book' Available options in 'form': paper recipe"),
+        ("form=book", "ecpo.py: There is no form=book; there are paper, recipe.\n"),
         ("policy=lstm", "ecpo.py: Could not override 'policy'. No match in the defaults list.\n"),
         ("+policy=lstm", "ecpo.py: policy= is for the algorithmic tasks and env=popgym, got"),
         ("env=popgym policy=tables", "ecpo.py: policy.tables=true is for the algorithmic tasks"),
-        ("env=algorithmic", "Could not find 'env/algorithmic' Available options in 'env': bandit"),
+        ("env=algorithmic", "There is no env=algorithmic; there are bandit, copy"),
         ("ecac env=gym", "ecac.py: env.name must be given.\n"),
+        ("env=bandit=1", "ecpo.py: env=bandit=1 cannot be read as NAME=VALUE: mismatched input '='"),
+        ("bandit seed=1", "ecpo.py: bandit cannot be read as NAME=VALUE: missing EQUAL at"),
+        ("seed=1,2", "ecpo.py: seed=1,2 is several runs: add --multirun. A list is in brackets."),
         ("resume=nowhere", "ecpo.py: resume=nowhere: there is no such directory.\n"),
     ],
 )
@@ -281,7 +288,7 @@ def test_a_refusal_is_one_line(refusal, options, message):
     [
         ("loss.control_variate=no", "ecpo.py: loss.control_variate must be true or false"),
         ("compile=true seeds=[0,1]", "ecpo.py: compile=true is for single runs"),
-        ("env=copy policy=gru", "Could not find 'policy/gru' Available options in 'policy': lstm"),
+        ("env=copy policy=gru", "ecpo.py: There is no policy=gru; there are lstm, memory"),
         ("ecac --multirun gamma=0,2", "ecac.py: gamma must be a number >= 0 and <= 1, got 2."),
         # When the run has begun.
         (

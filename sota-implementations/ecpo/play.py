@@ -35,9 +35,12 @@ def load_run(directory: Path) -> tuple[DictConfig, Task]:
 
     Raises:
         FileNotFoundError: if the directory is not that of a run.
+        ValueError: if it is that of a run of another script.
         CheckpointError: if the run has no checkpoint, or a damaged one.
     """
     config: Any = OmegaConf.load(directory / "config.yaml")
+    if not {"total_trajectories", "collector"} <= config.keys():
+        raise ValueError(f"{directory} is no run of ecpo.py.")
     if (directory / "checkpoints").is_dir():
         task = make_task(config)
         restore_part(

@@ -8,6 +8,11 @@ from __future__ import annotations
 from random import Random
 from typing import Any
 
+from torchrl_ecpo.experiment.options import check_command_line
+
+if __name__ == "__main__":  # before torch is imported, which takes seconds
+    check_command_line(__file__)
+
 import hydra
 import torch
 from datasets import Dataset
@@ -15,9 +20,9 @@ from omegaconf import DictConfig
 from tasks import TASKS
 from transformers import TrainerCallback
 from trl import GRPOConfig, GRPOTrainer  # pyright: ignore[reportPrivateImportUsage]
-from utils import Policy, check_model, make_model
+from utils import Policy, check_run, make_model
 
-from torchrl_ecpo.experiment import Run, check_command_line
+from torchrl_ecpo.experiment import Run, leaving_nothing
 
 
 class Logged(TrainerCallback):
@@ -37,6 +42,7 @@ class Logged(TrainerCallback):
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
+@leaving_nothing
 def main(config: DictConfig) -> None:
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
@@ -87,5 +93,5 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    check_command_line(__file__, lambda config, _: check_model(config))
+    check_command_line(__file__, lambda config, _: check_run(config, ("trl",)))
     main()

@@ -17,7 +17,7 @@ import torch
 from omegaconf import DictConfig
 from tasks import TASKS
 from torch.nn.utils import clip_grad_norm_
-from utils import Policy, check_model, make_loss, make_model
+from utils import LOSSES, Policy, check_run, make_loss, make_model
 
 from torchrl_ecpo.experiment import Checkpoints, Progress, Run, leaving_nothing
 
@@ -73,5 +73,5 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    check_command_line(__file__, lambda config, _: check_model(config))
+    check_command_line(__file__, lambda config, _: check_run(config, LOSSES))
     main()

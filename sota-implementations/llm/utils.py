@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection
 from math import comb
 from pathlib import Path
 from random import Random
@@ -27,8 +28,10 @@ LOCAL = {"local_files_only": True, "trust_remote_code": False}  # nor downloads,
 PASSES = (1, 8, 64)
 
 
-def check_model(config: DictConfig) -> None:
-    """Refuse a directory without a model that can be read, or with a tokenizer that cannot pad."""
+def check_run(config: DictConfig, losses: Collection[str]) -> None:
+    """Refuse a loss of the other script, and a directory without a model or without padding."""
+    if config.loss.name not in losses:
+        raise ValueError(f"loss= is here {' or '.join(losses)}, got {config.loss.name}.")
     if (path := config.model.path) is None:
         return
     if not all(map(list, map(Path(path).glob, ("*.safetensors", "tokenizer_config.json")))):

@@ -12,6 +12,11 @@ import sys
 from functools import partial
 from typing import Any
 
+from torchrl_ecpo.experiment.options import check_command_line
+
+if __name__ == "__main__":  # before torch is imported, which takes seconds
+    check_command_line(__file__)
+
 import gymnasium as gym
 import hydra
 import numpy as np
@@ -24,7 +29,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from torchrl_ecpo.envs import DeepSeaEnv, readable
-from torchrl_ecpo.experiment import Run, check_command_line
+from torchrl_ecpo.experiment import Run, leaving_nothing
 
 LEAST_ENTROPY = 0.1  # nats an episode
 
@@ -96,6 +101,7 @@ def make_env(config: DictConfig) -> gym.Env:
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
+@leaving_nothing
 def main(config: DictConfig) -> None:
     torch.set_num_threads(1)
     envs: Any = DummyVecEnv([partial(make_env, config)] * config.n_envs)
@@ -115,5 +121,4 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    check_command_line(__file__, lambda config, options: None)
     main()

@@ -464,7 +464,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--docs", type=Path, default=DOCS)
     options = parser.parse_args(arguments)
-    manifest = read_manifests(options.manifest)
+    try:
+        manifest = read_manifests(options.manifest)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
     print(write_report(manifest, options.results, options.docs))
     return 0
 

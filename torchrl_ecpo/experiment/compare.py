@@ -224,8 +224,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--output", type=Path, help="picture; by default beside the runs")
     parser.add_argument("--csv", type=Path, help="also write the curves as a csv table")
     options = parser.parse_args(arguments)
-    runs = find_runs(options.directories)
-    comparison = load_comparison(runs, options.metric, by=options.by, smoothing=options.smoothing)
+    try:
+        runs = find_runs(options.directories)
+        comparison = load_comparison(
+            runs, options.metric, by=options.by, smoothing=options.smoothing
+        )
+    except (FileNotFoundError, KeyError, ValueError) as error:
+        parser.error(error.args[0])
     print(comparison.table())
     for run in filter(_is_unfinished, runs):
         print(f"not finished, and curves are as long as the shortest one: {run}")

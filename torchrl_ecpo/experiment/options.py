@@ -23,7 +23,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import HydraException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.main import get_args_parser  # pyright: ignore[reportPrivateImportUsage]
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -61,6 +61,9 @@ def check_command_line(script: str, check: Check | None = None) -> None:
         options.append(f"hydra.searchpath=['{Path(flags.config_dir).absolute()}']")
     problems: dict[str, None] = {}  # of several runs, each once
     with _noting(problems), _initialized(folder / (flags.config_path or "config")):
+        if not (flags.multirun or flags.help or "hydra.mode=MULTIRUN" in options):
+            for line in [str(own.input_line) for own in parse(options) if own.is_sweep_override()]:
+                problems[f"{line} is several runs: add --multirun. A list is in brackets."] = None
         for run in [options] if flags.help else expand(options):
             with _noting(problems):
                 config = compose_options(folder, run, name)
@@ -83,8 +86,11 @@ def _noting(problems: dict[str, None]) -> Iterator[None]:
     except (ValueError, ImportError) as error:
         problems |= dict.fromkeys(str(error).splitlines())
     except (HydraException, OmegaConfBaseException) as error:
-        # Of hydra's lines without where it looked, and its advice to add a group.
-        message = re.split(r"\n(?:Config search path|To append)", str(error))[0]
+        # Of hydra's lines without where it looked, and its advice to add a group or to read on.
+        message = re.split(r"\n(?:Config search path|To append|See https)", str(error))[0]
+        if isinstance(error, OverrideParseException):
+            reason = message.splitlines()[-1]
+            message = f"{error.override} cannot be read as NAME=VALUE: {reason}."
         problems[" ".join(message.split())] = None
 
 
@@ -150,7 +156,13 @@ def compose_options(folder: Path, options: Sequence[str], name: str = "config") 
                 chosen.append(line)
             else:
                 values.append(line)
-        defaults = _defaults(file, name, tuple(chosen))
+        try:
+            defaults = _defaults(file, name, tuple(chosen))
+        except MissingConfigException:
+            absent = [*_absent(chosen)]
+            if not absent:
+                raise
+            raise ValueError("\n".join([*problems, *absent])) from None
         try:
             config = compose(name, [*chosen, *values]) if values else defaults
         except HydraException:
@@ -165,6 +177,17 @@ def compose_options(folder: Path, options: Sequence[str], name: str = "config") 
         if problems:
             raise ValueError("\n".join(problems))
         return config
+
+
+def _absent(chosen: Sequence[str]) -> Iterator[str]:
+    """What is chosen of a group that does not have it, in a line each."""
+    loader: Any = GlobalHydra.instance().config_loader()
+    search = [line for line in chosen if line.startswith("hydra.searchpath=")]
+    for own in parse(chosen):
+        group, value = own.key_or_group, own.value()
+        choices = loader.get_group_options(group, overrides=search)
+        if choices and isinstance(value, str) and value not in choices:
+            yield f"There is no {group}={value}; there are {', '.join(choices)}."
 
 
 def renamed(name: str, kinds: Mapping[str, str]) -> str:
