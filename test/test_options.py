@@ -271,7 +271,10 @@ def test_all_that_does_not_go_together_is_said(refusal):
         ("env=popgym policy=tables", "ecpo.py: policy.tables=true is for the algorithmic tasks"),
         ("env=algorithmic", "There is no env=algorithmic; there are bandit, copy"),
         ("ecac env=gym", "ecac.py: env.name must be given.\n"),
-        ("env=bandit=1", "ecpo.py: env=bandit=1 cannot be read as NAME=VALUE: mismatched input '='"),
+        (
+            "env=bandit=1",
+            "ecpo.py: env=bandit=1 cannot be read as NAME=VALUE: mismatched input '='",
+        ),
         ("bandit seed=1", "ecpo.py: bandit cannot be read as NAME=VALUE: missing EQUAL at"),
         ("seed=1,2", "ecpo.py: seed=1,2 is several runs: add --multirun. A list is in brackets."),
         ("resume=nowhere", "ecpo.py: resume=nowhere: there is no such directory.\n"),
