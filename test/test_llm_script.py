@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from random import Random
 
+import numpy as np
 import pytest
 
 pytest.importorskip("transformers")
@@ -231,22 +232,27 @@ def test_the_page_says_what_the_search_found(modules, tmp_path):
     runs = comparison.read_runs("llm_search")
     start = comparison.at_the_start(next(iter(runs.values()))[0])
     assert f"| at the start | | {comparison.cells([start])} |" in page
-    best = {"pass_at_1": {}, "pass_at_64": {}}
-    for (_, method, setting), (run,) in runs.items():
-        for name, by_rate in best.items():
-            end = comparison.at_the_end(run)[name]
-            by_rate.setdefault((method, setting.split("optim.lr ")[1]), []).append(end)
+    ends = {"pass_at_1": {}, "pass_at_64": {}}  # by method and rate, each setting's two seeds
+    for (_, method, setting), seeds in runs.items():
+        for name, by_rate in ends.items():
+            values = [comparison.at_the_end(run)[name] for run in seeds]
+            by_rate.setdefault((method, setting.split("optim.lr ")[1]), []).append(values)
     for method in ("ECPO", "PMD", "GRPO"):  # at the lower rate nobody trades
-        assert min(best["pass_at_1"][method, "0.00025"]) > 1.4 * start["pass_at_1"]
-        assert min(best["pass_at_64"][method, "0.00025"]) > start["pass_at_64"]
-    assert max(best["pass_at_64"]["GRPO", "0.0005"]) < 0.9 * start["pass_at_64"]
-    assert max(best["pass_at_64"]["ECPO", "0.0005"]) > 0.95 * start["pass_at_64"]
-    rows = comparison.table("llm_comparison") + comparison.table("llm_by_trl")
-    assert len(rows) == 5
+        lower = {name: np.mean(by_rate[method, "0.00025"], 1) for name, by_rate in ends.items()}
+        assert lower["pass_at_1"].min() >= 1.4 * start["pass_at_1"]
+        assert lower["pass_at_64"].min() > start["pass_at_64"]
+    for method, (first, second) in {"GRPO": (0.745, 0.952), "ECPO": (0.898, 0.981)}.items():
+        values = ends["pass_at_64"][method, "0.0005"][0]  # no bonus; tau = 0.5
+        assert np.round(values, 3).tolist() == [first, second]
+    assert np.max([ends["pass_at_1"]["TPO", rate] for rate in ("0.00025", "0.0005")]) < 0.101
+    studies = ("llm_comparison", "llm_longer", "llm_by_trl")
+    rows = [row for study in studies for row in comparison.table(study)]
+    assert len(rows) == 11
     assert all(row in page for row in rows)
     ends = {
         method: [comparison.at_the_end(run) for run in seeds]
-        for (_, method, _), seeds in comparison.read_runs("llm_comparison").items()
+        for (task, method, _), seeds in comparison.read_runs("llm_comparison").items()
+        if task == "countdown"
     }
     pairs = list(zip(ends["ECPO"], ends["GRPO"], strict=True))
     for name, above, level in (("pass_at_1", 0, 1), ("pass_at_64", 3, 0), ("distinct_right", 2, 0)):

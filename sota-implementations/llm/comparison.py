@@ -69,17 +69,18 @@ def draw(path: Path) -> None:
     figure = Figure(figsize=(6.5, 3.8), layout="constrained")
     axes, runs = figure.subplots(), read_runs("llm_search")
     colours = colours_of(dict.fromkeys(method for _, method, _ in runs))
-    for (_, method, setting), (rows,) in runs.items():
-        end, rate = at_the_end(rows), setting.split("optim.lr ")[1]
-        marker = "o" if rate == "0.00025" else "^"
-        axes.plot(end["pass_at_1"], end["pass_at_64"], marker, color=colours[method])
-    start = at_the_start(rows)
+    for (_, method, setting), seeds in runs.items():
+        ends = [at_the_end(rows) for rows in seeds]
+        end = [fmean(each[name] for each in ends) for name in ("pass_at_1", "pass_at_64")]
+        marker = "o" if setting.endswith("optim.lr 0.00025") else "^"
+        axes.plot(*end, marker, color=colours[method])
+    start = at_the_start(seeds[0])
     axes.plot(start["pass_at_1"], start["pass_at_64"], "*", color=NEUTRAL, markersize=10)
     for method, colour in colours.items():
         axes.plot([], [], "s", color=colour, label=method)
     for marker, label in {"o": "rate 0.00025", "^": "rate 0.0005", "*": "start"}.items():
         axes.plot([], [], marker, color=NEUTRAL, label=label)
-    axes.set(xlabel="pass@1", ylabel="pass@64", title="Countdown, 3,840 completions, one seed")
+    axes.set(xlabel="pass@1", ylabel="pass@64", title="Countdown, 3,840 completions, two seeds")
     figure.legend(loc="outside right upper")
     save_figure(figure, path)
 
@@ -87,7 +88,7 @@ def draw(path: Path) -> None:
 if __name__ == "__main__":
     (rows, *_) = next(iter(read_runs("llm_search").values()))
     print(f"| at the start | | {cells([at_the_start(rows)])} |")
-    for study in ("llm_search", "llm_comparison", "llm_by_trl"):
+    for study in ("llm_search", "llm_comparison", "llm_longer", "llm_by_trl"):
         if (RESULTS / study).exists():
             print(*table(study), sep="\n")
     draw(ROOT / "docs/figures/llm_search.svg")

@@ -68,7 +68,7 @@ METHOD_COLOURS = {
     **dict.fromkeys(("repsentropy", "lstm", "aselsewhereat1e3"), BROWN),
     **dict.fromkeys(("smallstartat3e4", "ofthegroup", "windowoffour"), BLUE),
     **dict.fromkeys(("ofthebatch", "memoryless"), GREEN),
-    "ppo": BROWN,
+    "ppo": ORANGE,
 }
 """The colour of a method in every picture, by the letters and digits of its name."""
 
