@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 from processes import run_script
 from tensordict import TensorDict
-from torchrl.envs import GymEnv
+from torchrl.envs import GymEnv, GymWrapper
 from torchrl.objectives import SACLoss
 
 from torchrl_ecpo.experiment import read_metrics
@@ -341,13 +341,13 @@ def test_a_missing_simulator_is_named_with_its_extra(utils, monkeypatch):
     ],
 )
 def test_a_video_that_cannot_be_drawn_says_what_to_install(utils, monkeypatch, error, message):
-    class Env(utils.GymWrapper):
+    class Env(GymWrapper):
         def __init__(self, env, *, from_pixels, **options):
             if from_pixels:
                 raise error from ImportError("pygame")
             super().__init__(env)
 
-    monkeypatch.setattr(utils, "GymWrapper", Env)
+    monkeypatch.setattr("torchrl_ecpo.experiment._tasks.GymWrapper", Env)
     config = configure(["evaluation.video=true"])
     with pytest.raises(ValueError, match=f"There is no video of {message}"):
         utils.make_evaluation_environment(config)

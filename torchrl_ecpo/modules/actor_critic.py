@@ -3,9 +3,7 @@
 All networks are multi-layer perceptrons with ReLU; by default two layers of 256 units, the usual
 size for SAC and TD3 on the MuJoCo tasks. They read ``observation``, a vector, or pixels through a
 :class:`~torchrl_ecpo.modules.PixelEncoder` of their own; an actor writes ``action`` within the
-bounds of its specification. Everywhere ``observation_size`` is the length of a vector, or
-``(C, H, W)`` of pixels, ``action_spec`` that of one environment, and ``hidden_sizes`` are the units
-of each hidden layer.
+bounds of its specification.
 """
 
 from __future__ import annotations
@@ -276,7 +274,12 @@ def make_deterministic_actor(
     *,
     hidden_sizes: Sequence[int] = HIDDEN_SIZES,
 ) -> TensorDictSequential:
-    """A deterministic policy, for TD3 and DDPG: tanh, scaled to the bounds of actions ``[A]``.
+    """A deterministic policy, for TD3 and DDPG: tanh, scaled to the bounds of the actions.
+
+    Args:
+        observation_size: length of an observation vector, or ``(C, H, W)`` of pixels.
+        action_spec: of one environment, bounded, ``[A]``.
+        hidden_sizes: units of each hidden layer. Default: (256, 256).
 
     Raises:
         ValueError: if the actions are not vectors of numbers within finite bounds.
@@ -303,6 +306,11 @@ def make_qvalue_network(
 ) -> TensorDictModuleBase:
     """Q(s, a): reads ``observation`` and ``action``, writes ``state_action_value`` ``[..., 1]``.
 
+    Args:
+        observation_size: length of an observation vector, or ``(C, H, W)`` of pixels.
+        action_size: length A of an action vector.
+        hidden_sizes: units of each hidden layer. Default: (256, 256).
+
     Examples:
         >>> import torch
         >>> qvalue = make_qvalue_network(3, 2)
@@ -318,6 +326,10 @@ def make_value_network(
 ) -> TensorDictModuleBase:
     """V(s): reads ``observation``, writes ``state_value`` ``[..., 1]``.
 
+    Args:
+        observation_size: length of an observation vector, or ``(C, H, W)`` of pixels.
+        hidden_sizes: units of each hidden layer. Default: (256, 256).
+
     Examples:
         >>> import torch
         >>> make_value_network(3)(observation=torch.zeros(5, 3)).shape
@@ -332,7 +344,12 @@ def make_categorical_actor(
     *,
     hidden_sizes: Sequence[int] = HIDDEN_SIZES,
 ) -> ProbabilisticTensorDictSequential:
-    """A policy over one of n actions (torchrl's ``Categorical``), for the discrete losses.
+    """A policy over one of n actions, for the discrete losses.
+
+    Args:
+        observation_size: length of an observation vector, or ``(C, H, W)`` of pixels.
+        action_spec: of one environment: ``Categorical``, an integer.
+        hidden_sizes: units of each hidden layer. Default: (256, 256).
 
     Raises:
         ValueError: if an action is not one integer.
@@ -366,6 +383,11 @@ def make_action_value_network(
     hidden_sizes: Sequence[int] = HIDDEN_SIZES,
 ) -> TensorDictModuleBase:
     """Q(s, .): reads ``observation``, writes ``action_value`` ``[..., n]``, of each of n actions.
+
+    Args:
+        observation_size: length of an observation vector, or ``(C, H, W)`` of pixels.
+        num_actions: n.
+        hidden_sizes: units of each hidden layer. Default: (256, 256).
 
     Examples:
         >>> import torch

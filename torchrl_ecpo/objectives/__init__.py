@@ -2,12 +2,15 @@
 
 from torchrl_ecpo.objectives.actor_critic import ActorCriticLoss, Lift, States
 from torchrl_ecpo.objectives.ecac import DiscreteECACLoss, ECACLoss
-from torchrl_ecpo.objectives.ecpo import ECPOLoss, REPSLoss
+from torchrl_ecpo.objectives.ecpo import ECPOLoss
 from torchrl_ecpo.objectives.grpo import GRPOLoss
-from torchrl_ecpo.objectives.ment import MENTLoss, RLOOLoss
+from torchrl_ecpo.objectives.ment import MENTLoss
 from torchrl_ecpo.objectives.mpo import MPOLoss
-from torchrl_ecpo.objectives.pmd import PMDLoss, SquaredPMDLoss
+from torchrl_ecpo.objectives.pmd import PMDLoss
 from torchrl_ecpo.objectives.pmd_ac import DiscretePMDACLoss, PMDACLoss
+from torchrl_ecpo.objectives.reps import REPSLoss
+from torchrl_ecpo.objectives.rloo import RLOOLoss
+from torchrl_ecpo.objectives.squared_pmd import SquaredPMDLoss
 from torchrl_ecpo.objectives.tpo import TPOLoss
 from torchrl_ecpo.objectives.trajectory import (
     LiftProjectLoss,

@@ -155,16 +155,17 @@ class ActorCriticLoss(PolicyLoss):
         """Entries of the input tensordict, of leading shape ``[*B]``.
 
         Attributes:
-            action: what was done.
-            reward: ``[*B, 1]``, read from ``"next"``.
-            done: ``[*B, 1]``, read from ``"next"``.
+            action: what was done. Defaults to ``"action"``.
+            reward: ``[*B, 1]``, read from ``"next"``. Defaults to ``"reward"``.
+            done: ``[*B, 1]``, read from ``"next"``. Defaults to ``"done"``.
             terminated: ``[*B, 1]``, read from ``"next"``: where there is no state to come, as
-                opposed to a time limit.
-            value: written by the value network.
-            state_action_value: written by a Q network that reads the action.
-            action_value: written by a Q network of all actions.
-            priority: written into the input.
-            priority_weight: of prioritised replay.
+                opposed to a time limit. Defaults to ``"terminated"``.
+            value: written by the value network. Defaults to ``"state_value"``.
+            state_action_value: written by a Q network that reads the action. Defaults to
+                ``"state_action_value"``.
+            action_value: written by a Q network of all actions. Defaults to ``"action_value"``.
+            priority: written into the input. Defaults to ``"td_error"``.
+            priority_weight: of prioritised replay. Defaults to ``"priority_weight"``.
         """
 
         action: NestedKey = "action"

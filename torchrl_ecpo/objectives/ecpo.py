@@ -1,25 +1,22 @@
-"""Exploratory Conservative Policy Optimization, and relative entropy policy search by its lift."""
+"""Exploratory Conservative Policy Optimization."""
 
 from __future__ import annotations
 
-import math
-from typing import Any, Literal
+from typing import Literal
 
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
-from torchrl_ecpo.checks import as_float, check_choice, check_flag
+from torchrl_ecpo.checks import check_choice, check_flag
 from torchrl_ecpo.functional import (
     Surrogate,
-    lift_divergence_estimate,
     lifted_log_weights,
     matched_temperature,
     mean_seeking_projection,
-    self_normalised_weights,
 )
-from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, TrajectoryGroups
+from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, Score, TrajectoryGroups
 
-__all__ = ["ECPOLoss", "REPSLoss"]
+__all__ = ["ECPOLoss"]
 
 
 class ECPOLoss(LiftProjectLoss):
@@ -54,7 +51,11 @@ class ECPOLoss(LiftProjectLoss):
         control_variate: if True, the self-normalised ratios pi_theta/pi_bar are subtracted from
             the weights, which removes the drift of groups without a preference. Defaults to False
             (the paper).
-        options: ``score``, ``delay_actor`` and ``reduction``, see :class:`TrajectoryGroupLoss`.
+        score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
+        delay_actor: if True, the reference policy is the loss's own delayed copy of the actor, see
+            :class:`TrajectoryGroupLoss`. Defaults to False: the recorded log-probability is the
+            reference's, as in Algorithm 1.
+        reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
     Raises:
         ValueError: for an unknown `entropy`, for ``"matched"`` with ``score="return"``, and as
@@ -96,14 +97,24 @@ class ECPOLoss(LiftProjectLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         *,
+        tau: float = 0.5,
         tau_prime: float = 0.01,
         entropy: Literal["nats", "matched"] = "nats",
         control_variate: bool = False,
-        **options: Any,
+        score: Score = "return",
+        delay_actor: bool = False,
+        reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
-        super().__init__(actor_network, tau_prime=tau_prime, **options)
+        super().__init__(
+            actor_network,
+            tau=tau,
+            tau_prime=tau_prime,
+            score=score,
+            delay_actor=delay_actor,
+            reduction=reduction,
+        )
         check_choice("entropy", entropy, ("nats", "matched"))
-        if entropy == "matched" and self.score == "return":
+        if entropy == "matched" and score == "return":
             raise ValueError(
                 "entropy='matched' needs scores in deviations: score='group' or 'batch', got "
                 "score='return'."
@@ -127,81 +138,4 @@ class ECPOLoss(LiftProjectLoss):
             self.lift(groups) + groups.reference_log_prob - behaviour,
             control_log_prob=behaviour if self.control_variate else None,
             mask=groups.mask,
-        )
-
-
-class REPSLoss(ECPOLoss):
-    r"""REPS: ECPO with a bound on the lift instead of a temperature.
-
-    Peters, Mülling and Altün, "Relative Entropy Policy Search", AAAI 2010: of the targets within
-    epsilon nats of the reference, the one with the highest return. Tau minimises the bound's dual,
-
-    .. math::
-        g(\tau) = \tau \epsilon + (\tau + \tau') \log \frac1K \sum_k
-            \exp \frac{r(\rho_k) - \tau' \log \bar\pi(\rho_k)}{\tau + \tau'}, \qquad
-        g'(\tau) = \epsilon - D_{KL}(\bar\pi^* \| \bar\pi)
-
-    in the mean over the groups: ``loss_tau`` is a loss of the parameter ``log_tau`` alone, with the
-    gradient g'. Add it to ``loss_actor``.
-
-    The actor and what is not described here are as in :class:`ECPOLoss`.
-
-    Keyword Args:
-        epsilon: how far the lift goes, in nats; above 0, and below log K. Defaults to 0.5
-            (ours).
-        tau: where the temperature starts, in the unit of the score. Defaults to 1.
-        tau_prime: temperature of the entropy. Defaults to 0 (REPS has none).
-
-    Raises:
-        ValueError: also for an epsilon that is not above 0, or, when called, not below log K.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_ecpo.envs import BanditEnv
-        >>> from torchrl_ecpo.modules import make_softmax_policy
-        >>> env = BanditEnv(num_actions=6, num_groups=3, group_size=4)
-        >>> actor = make_softmax_policy(env.features)
-        >>> loss_module = REPSLoss(actor, epsilon=0.5)
-        >>> loss = loss_module(env.rollout(1, actor))  # 3 groups of 4 trajectories of 1 step
-        >>> (loss["loss_actor"] + loss["loss_tau"]).backward()
-        >>> torch.allclose(loss_module.log_tau.grad, 0.5 - loss["kl_target_reference"])
-        True
-    """
-
-    losses, metrics = ("loss_tau",), ("ESS", "max_weight", "tau", "kl_target_reference")
-
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        *,
-        epsilon: float = 0.5,
-        tau: float = 1.0,
-        tau_prime: float = 0.0,
-        **options: Any,
-    ) -> None:
-        super().__init__(actor_network, tau=tau, tau_prime=tau_prime, **options)
-        self.epsilon = as_float("epsilon", epsilon)
-        if not 0 < self.epsilon < math.inf:
-            raise ValueError(f"epsilon must be above 0, in nats, got {epsilon!r}.")
-        self.learn("tau", float(tau))
-
-    def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
-        """ECPO's, at the temperature that has been found."""
-        size = groups.returns.shape[-1]
-        if self.epsilon >= math.log(size):
-            raise ValueError(
-                f"epsilon must be below log K = {math.log(size):.3g}, which is as far as a lift of "
-                f"groups of {size} goes, got {self.epsilon}."
-            )
-        projection = super().surrogate(groups)
-        assert projection.weights is not None
-        log_base = groups.reference_log_prob - groups.behaviour_log_prob
-        divergence = lift_divergence_estimate(
-            projection.weights,
-            base_weights=self_normalised_weights(log_base, mask=groups.mask),
-            mask=groups.mask,
-        )
-        return projection._replace(
-            losses={"loss_tau": self.dual("tau", divergence - self.epsilon)},
-            metrics={"tau": self.temperature("tau"), "kl_target_reference": divergence},
         )

@@ -38,7 +38,8 @@ class GRPOLoss(TrajectoryGroupLoss):
 
     with rho the ratio to the policy that drew the trajectories, and d = log pi_bar - log pi.
 
-    The actor and what is not described here are as in :class:`TrajectoryGroupLoss`.
+    Args:
+        actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.
 
     Keyword Args:
         clip_epsilon: epsilon, or (epsilon_low, epsilon_high). Defaults to 0.2 (PPO).
@@ -48,6 +49,9 @@ class GRPOLoss(TrajectoryGroupLoss):
             ``"prompt_sum"``, their sum, c = T; ``"token_mean"``, over all steps, c = T / mean T.
         ratio: of each ``"step"`` (default), or of the ``"trajectory"``: their geometric mean.
         kl_to_ref_coeff: beta, scheduled as a temperature. Defaults to 0; DeepSeekMath has 0.04.
+        delay_actor: if True, the reference is the loss's own delayed copy of the actor. Defaults
+            to False: it is the policy that drew the trajectories.
+        reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
     Raises:
         ValueError: for a `clip_epsilon` below 0 or, downwards, of 1 or more, for an unknown

@@ -78,8 +78,14 @@ class MPOLoss(ActorCriticLoss):
         >>> updater = UpdaterSequence(
         ...     PeriodicCopy(loss_module, "actor_network", interval=100),
         ...     PolyakAverage(loss_module, "qvalue_network"))
+        >>> losses = loss_module(
+        ...     observation=torch.randn(5, 3), action=torch.rand(5, 2) * 2 - 1,
+        ...     next_observation=torch.randn(5, 3), next_reward=torch.rand(5, 1),
+        ...     next_done=torch.zeros(5, 1, dtype=torch.bool),
+        ...     next_terminated=torch.zeros(5, 1, dtype=torch.bool))
         >>> loss_module.out_keys[:5]
         ['loss_actor', 'loss_qvalue', 'loss_tau', 'loss_alpha_mean', 'loss_alpha_scale']
+        >>> sum(losses[:5]).backward()
     """
 
     losses = ("loss_tau", "loss_alpha_mean", "loss_alpha_scale")

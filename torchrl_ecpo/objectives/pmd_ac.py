@@ -43,6 +43,7 @@ class PMDACLoss(ActorCriticLoss):
         ValueError: as :class:`~torchrl_ecpo.ECACLoss`.
 
     Examples:
+        >>> import torch
         >>> from torchrl.data import Bounded
         >>> from torchrl_ecpo import PeriodicCopy, PolyakAverage, UpdaterSequence
         >>> from torchrl_ecpo.modules import make_qvalue_network, make_tanh_gaussian_actor
@@ -51,8 +52,14 @@ class PMDACLoss(ActorCriticLoss):
         >>> updater = UpdaterSequence(
         ...     PeriodicCopy(loss_module, "actor_network", interval=100),
         ...     PolyakAverage(loss_module, "qvalue_network"))
+        >>> losses = loss_module(
+        ...     observation=torch.randn(5, 3), action=torch.rand(5, 2) * 2 - 1,
+        ...     next_observation=torch.randn(5, 3), next_reward=torch.rand(5, 1),
+        ...     next_done=torch.zeros(5, 1, dtype=torch.bool),
+        ...     next_terminated=torch.zeros(5, 1, dtype=torch.bool))
         >>> loss_module.out_keys[:3]
         ['loss_actor', 'loss_qvalue', 'loss_tau_prime']
+        >>> sum(losses[:3]).backward()
     """
 
     def __init__(

@@ -29,14 +29,17 @@ class TPOLoss(TrajectoryGroupLoss):
     :class:`ECPOLoss`'s weights with an entropy term of the other sign,
     tau_prime / (tau + tau_prime) = -1.
 
-    The actor and what is not described here are as in :class:`TrajectoryGroupLoss`.
+    Args:
+        actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.
 
     Keyword Args:
         tau: temperature, in the unit of the score: the paper's eta. Defaults to 1 (the paper).
         score: u, see :class:`TrajectoryGroupLoss`. Defaults to ``"group"`` (the paper).
         length_norm: if True, log-probabilities are divided by the number of steps, in p and in q.
             Defaults to False.
-        delay_actor: nothing corrects for another policy that drew the trajectories.
+        delay_actor: see :class:`ECPOLoss`. Defaults to False. Nothing corrects for another policy
+            that drew the trajectories.
+        reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
     Raises:
         ValueError: for a `tau` that is not above 0, a `length_norm` that is no bool, and as

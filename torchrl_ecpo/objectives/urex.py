@@ -23,10 +23,13 @@ class UREXLoss(TrajectoryGroupLoss):
         L(\theta) = -\frac1K \sum_k (S_k - \bar S) \log \pi_\theta(\rho_k), \quad
         S_k = r_k + \tau K\, \mathrm{softmax}_k(r_k / \tau - \log \pi_\theta(\rho_k))
 
-    The actor and what is not described here are as in :class:`TrajectoryGroupLoss`.
+    Args:
+        actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.
 
     Keyword Args:
         tau: temperature, in the unit of the score; above 0. Defaults to 0.1, the UREX paper's.
+        score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
+        reduction: ``"mean"`` over groups (default), ``"sum"`` or ``"none"``.
 
     Raises:
         ValueError: for a `tau` that is not above 0, and as :class:`TrajectoryGroupLoss`.
