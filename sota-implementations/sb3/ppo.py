@@ -107,7 +107,8 @@ def main(config: DictConfig) -> None:
     envs: Any = DummyVecEnv([partial(make_env, config)] * config.n_envs)
     if config.normalize:
         envs = VecNormalize(envs, gamma=config.ppo.gamma)
-    method, policy = (RecurrentPPO, "MlpLstmPolicy") if config.recurrent else (PPO, "MlpPolicy")
+    is_recurrent = config.get("recurrent", False)  # of env=popgym alone
+    method, policy = (RecurrentPPO, "MlpLstmPolicy") if is_recurrent else (PPO, "MlpPolicy")
     model = method(policy, envs, seed=config.seed, device="cpu", **config.ppo)
     run = Run(
         config,
