@@ -345,9 +345,9 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
     """Draws complete groups of whole trajectories from a flat replay buffer, as `[G, K, T]`.
 
     A batch has `G` = batch size / `K` distinct groups, uniformly drawn, and `K` distinct
-    trajectories of each. Groups
-    with fewer than `K` trajectories wait; of larger ones `K` are drawn. Group ids must be unique
-    within the storage: trajectories that share one are drawn as one group.
+    trajectories of each. Groups with fewer than `K` trajectories wait; of larger ones `K` are
+    drawn. Group ids must be unique within the storage: trajectories that share one are drawn as one
+    group.
 
     The storage holds steps, trajectory after trajectory, as
     ``Collector(trajs_per_batch=..., replay_buffer=...)`` and

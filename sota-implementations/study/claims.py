@@ -183,7 +183,7 @@ def when(path: str) -> float:
 def solved_by_task(study: str, name: str) -> list[list[float]]:
     """Of each task of a study: how many runs of a cell solve it, and when; 0 where none does."""
     paths = [f"{study}/{task}/{name}" for task in manifest().studies[study].tasks]
-    return [[solved(path)[0], when(path)] if solved(path)[0] else [0] for path in paths]
+    return [[count, when(path)] if (count := solved(path)[0]) else [0] for path in paths]
 
 
 def lost(path: str) -> int:
