@@ -7,10 +7,12 @@ thing after another.
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -259,8 +261,7 @@ class _Process(_Worker):
 
     def cause(self) -> str:
         """How the process ended."""
-        self.process.join(5.0)
-        code = self.process.exitcode
+        code = self._exit_code(5.0)
         if code is None or code >= 0:
             return f"ended with exit code {code}: its own error is printed above"
         hint = ", as the system does when memory runs out" if code == -signal.SIGKILL else ""
@@ -269,9 +270,16 @@ class _Process(_Worker):
     def kill(self) -> None:
         """End the process, at once if it is busy."""
         self._pool.shutdown(wait=False, cancel_futures=True)
-        self.process.join(0.5)
+        self._exit_code(0.5)
         self.process.kill()
-        self.process.join()
+        self._exit_code(math.inf)
+
+    def _exit_code(self, seconds: float) -> int | None:
+        """The exit code, waited for. A join returns at once where the pool's thread joins."""
+        deadline = time.monotonic() + seconds
+        while self.process.exitcode is None and time.monotonic() < deadline:
+            time.sleep(0.002)
+        return self.process.exitcode
 
 
 class _Actor(_Worker):
