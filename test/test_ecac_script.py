@@ -255,11 +255,24 @@ def test_one_discrete_action_has_a_loss_of_its_own(tmp_path, train):
     process = start(tmp_path, *TINY[:-1], f"hydra.run.dir={tmp_path}", *CARTPOLE)
     assert process.returncode == 0, process.stderr
     assert OmegaConf.load(tmp_path / "config.yaml").loss.name == "discrete_ecac"
-    other = train(tmp_path / "pmd", *CARTPOLE, "loss=discrete_pmd_ac")
-    for metrics in (read_metrics(tmp_path), other):
+    others = (
+        train(tmp_path / loss, *CARTPOLE, f"loss={loss}")
+        for loss in ("discrete_pmd_ac", "discrete_sac")
+    )
+    for metrics in (read_metrics(tmp_path), *others):
         assert metrics["step"][-1] == 240
         assert all(map(math.isfinite, metrics["loss_actor"][1:]))
         assert 0.6 < metrics["entropy"][-1] <= math.log(2) + 1e-6
+
+
+def test_a_game_of_minatar_and_fewer_updates_than_frames(tmp_path, train):
+    pytest.importorskip("minatar")
+    game = ("env=minatar", "env.name=MinAtar/Freeway-v1", "loss=discrete_ecac")
+    metrics = train(tmp_path, *game, "loss.target_entropy=auto", "loss.target_entropy_weight=0.3")
+    assert metrics["step"][-1] == 240
+    assert all(map(math.isfinite, metrics["loss_actor"][1:]))
+    (progress,) = tmp_path.glob("checkpoints/*/components/*-progress/state.pt")
+    assert torch.load(progress)["updates"] == (240 - 80) / 4
 
 
 @pytest.mark.parametrize(
@@ -289,6 +302,7 @@ def test_bad_options_end_with_a_clear_message(utils, overrides, message):
         ("env=gym env.name=Pendulum-v1", []),
         ("env=gym env.name=Chess-v0", []),
         ("env=gym", []),
+        ("env=minatar env.name=MinAtar/Breakout-v1", ["loss=discrete_ecac"]),
         ("env=pendulum", []),
     ],
 )

@@ -221,3 +221,11 @@ def as_fraction(name: str, value: Any) -> float:
     if not 0 <= number <= 1:
         raise ValueError(f"{name} must be in [0, 1], got {number}.")
     return number
+
+
+def as_share(name: str, value: Any) -> float:
+    """A number between 0 and 1, neither of them."""
+    number = as_float(name, value)
+    if not 0 < number < 1:
+        raise ValueError(f"{name} must be in (0, 1), got {number}.")
+    return number

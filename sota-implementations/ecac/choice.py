@@ -11,8 +11,10 @@ import gymnasium as gym
 def chosen_loss(options: Sequence[str]) -> list[str]:
     """The option ``loss=``, if none is given and a task of gymnasium takes one discrete action."""
     given = {name: value for name, _, value in (option.partition("=") for option in options)}
-    if "loss" in given or given.get("env") != "gym":
+    if "loss" in given or given.get("env") not in ("gym", "minatar"):
         return []
+    if given["env"] == "minatar":
+        return ["loss=discrete_ecac"]
     with (
         suppress(gym.error.Error, ModuleNotFoundError, ValueError),  # which is said later
         closing(gym.make(given.get("env.name", ""), disable_env_checker=True)) as env,

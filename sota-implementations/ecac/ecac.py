@@ -129,7 +129,7 @@ def main(config: DictConfig) -> None:
             replay_buffer.extend(transitions.select(*loss_module.in_keys, strict=False))
 
             if progress.frames > config.collector.init_random_frames:
-                for _ in range(len(transitions) * config.updates_per_frame):
+                for _ in range(int(len(transitions) * config.updates_per_frame)):
                     is_policy_due = (progress.updates + 1) % config.loss.policy_delay == 0
                     batch = replay_buffer.sample()
                     # What is compiled is the whole.

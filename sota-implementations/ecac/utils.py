@@ -29,7 +29,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 from torchrl.modules import AdditiveGaussianModule
-from torchrl.objectives import DDPGLoss, LossModule, TargetNetUpdater, TD3Loss
+from torchrl.objectives import DDPGLoss, DiscreteSACLoss, LossModule, TargetNetUpdater, TD3Loss
 from width_sac import WidthSACLoss
 
 from torchrl_ecpo import (
@@ -64,6 +64,7 @@ LOSSES = {
     "discrete_ecac": DiscreteECACLoss,
     "pmd_ac": PMDACLoss,
     "discrete_pmd_ac": DiscretePMDACLoss,
+    "discrete_sac": partial(DiscreteSACLoss, action_space="categorical"),
     "mpo": MPOLoss,
     "sac": WidthSACLoss,
     "sac_score": ScoreSACLoss,
@@ -91,6 +92,12 @@ SHOWN = ("evaluation_return", "return", "entropy", "alpha", "tau", "tau_prime", 
 
 def check_config(config: DictConfig, options: Sequence[str] = ()) -> None:
     """Refuse options that do not go together."""
+    batch, per_frame = config.collector.frames_per_batch, config.updates_per_frame
+    if batch * per_frame % 1:
+        raise ValueError(
+            f"collector.frames_per_batch={batch} times updates_per_frame={per_frame} must be a "
+            f"whole number of updates, got {batch * per_frame:g}."
+        )
     with closing(make_environment(config, seed=config.seed)) as env:
         make_actor(config, env)
 
@@ -145,8 +152,9 @@ def make_actor(config: DictConfig, env: EnvBase) -> TensorDictModuleBase:
     if not isinstance(spec, kind) or (kind is Categorical and spec.ndim):
         raise ValueError(
             f"loss={config.loss.name} does not go with env.name={config.env.name}, whose actions "
-            f"are {type(spec).__name__}: one discrete action is for loss=discrete_ecac or "
-            "discrete_pmd_ac, a vector of numbers for the others, and any others for ecpo.py."
+            f"are {type(spec).__name__}: one discrete action is for loss=discrete_ecac, "
+            "discrete_pmd_ac or discrete_sac, a vector of numbers for the others, and any others "
+            "for ecpo.py."
         )
     return ACTORS[config.loss.actor](_observation_size(env), spec, hidden_sizes=config.hidden_sizes)
 
@@ -173,7 +181,9 @@ def make_loss(config: DictConfig, actor: TensorDictModuleBase, env: EnvBase) -> 
         options["action_spec"] = action_spec
         options["policy_noise"] *= _half_range(action_spec)
         options["noise_clip"] *= _half_range(action_spec)
-    if config.loss.name in ("sac", "sac_score", "td3"):
+    if config.loss.name == "discrete_sac":
+        options["num_actions"] = action_spec.n
+    if config.loss.name in ("sac", "discrete_sac", "sac_score", "td3"):
         options["deactivate_vmap"] = True  # the faster way on a CPU; the numbers are the same
     loss_module = LOSSES[config.loss.name](actor, *critics, **options)
     loss_module.make_value_estimator(gamma=config.gamma)

@@ -24,6 +24,7 @@ OPTIONS = {
     "delay_actor": False,
     "delay_qvalue": True,
     "target_entropy": None,
+    "target_entropy_weight": 0.5,
     "target_kl": None,
     "width_entropy": 1.0,
     "epsilon": 0.2,

@@ -1170,10 +1170,12 @@ def test_entropies_that_no_policy_has(name, allowed, target):
 
 
 @pytest.mark.parametrize("allowed", [2, CHOICES])
-def test_auto_follows_the_mask(allowed):
-    loss, batch = _masked("discrete_ecac", allowed, target_entropy="auto")
+@pytest.mark.parametrize(("name", "weight"), [("discrete_ecac", 0.98), ("discrete_pmd_ac", 0.3)])
+def test_auto_follows_the_mask(name, allowed, weight):
+    options = {} if weight == 0.98 else {"target_entropy_weight": weight}
+    loss, batch = _masked(name, allowed, target_entropy="auto", **options)
     outputs = loss(batch)
-    excess = 0.98 * math.log(allowed) - outputs["entropy"]
+    excess = weight * math.log(allowed) - outputs["entropy"]
     assert_close(outputs["loss_tau_prime"], -loss.log_tau_prime * excess)
 
 

@@ -17,6 +17,8 @@ from torchrl_ecpo.envs import readable
 def open_raw_task(name: str, **options: Any) -> gym.Env:
     """A task of gymnasium by its id, as it is, or an error that names ``env.name``."""
     try:
+        if name.startswith("MinAtar/"):
+            _register_minatar()
         return gym.make(name, disable_env_checker=True, **options)
     except (gym.error.DependencyNotInstalled, ModuleNotFoundError) as error:
         raise missing(f"env.name={name}", error) from error
@@ -25,6 +27,14 @@ def open_raw_task(name: str, **options: Any) -> gym.Env:
             f"env.name={name} is no task of gymnasium: {' '.join(str(error).split())} If another "
             "module registers it, name that too: env.name=module:Task-v0."
         ) from error
+
+
+def _register_minatar() -> None:
+    """Let gymnasium know MinAtar's games, which their package does when it is asked only."""
+    import minatar.gym
+
+    if "MinAtar/Breakout-v1" not in gym.registry:
+        minatar.gym.register_envs()
 
 
 def open_task(name: str, window: int = 1, **options: Any) -> gym.Env:

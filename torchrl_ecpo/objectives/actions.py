@@ -130,9 +130,9 @@ class SampledActions(NamedTuple):
         """KL(target, policy) ``[*B]`` in nats, estimated; from normalised weights ``[M, *B]``."""
         return lift_divergence_estimate(weights, sample_dim=0)
 
-    def entropy_target(self, target: float | str) -> float:
-        """What is meant by ``"auto"``: -A nats, SAC's."""
-        return -float(self.action.shape[-1]) if isinstance(target, str) else target
+    def auto_entropy(self) -> float:
+        """What ``"auto"`` asks for, up to its weight: -A nats, SAC's."""
+        return -float(self.action.shape[-1])
 
     def entropy_range(self, distribution: Distribution) -> tuple[float, Tensor]:
         """Minus infinity, and the log-volume ``[*B]`` of where actions may lie, if it is known."""
@@ -223,23 +223,14 @@ class AllActions(NamedTuple):
         """KL(target, policy) ``[*B]`` in nats; from normalised weights ``[n, *B]``."""
         return (weights * (log_weights.log_softmax(0) - self.log_prob)).sum(0)
 
-    def entropy_target(self, target: float | str) -> Tensor | float:
-        """What is meant by ``"auto"``: 0.98 log n nats, that of TorchRL's ``DiscreteSACLoss``.
-
-        n ``[*B]`` is the number of actions that a mask leaves.
-        """
-        if not isinstance(target, str):
-            return target
-        return 0.98 * self._log_share() + 0.98 * math.log(len(self.log_prob))
+    def auto_entropy(self) -> Tensor:
+        """What ``"auto"`` asks for, up to its weight: log n ``[*B]`` of the n allowed actions."""
+        number = (self.log_prob > _impossible(self.log_prob)).sum(0).clamp_min(1)
+        return number.to(self.log_prob.dtype).log()
 
     def entropy_range(self, distribution: Distribution) -> tuple[float, Tensor]:
         """0, and log n ``[*B]`` of the n actions that a mask leaves."""
-        return 0.0, self._log_share() + math.log(len(self.log_prob))
-
-    def _log_share(self) -> Tensor:
-        """Logarithm ``[*B]`` of the share of the actions that may be taken."""
-        number = (self.log_prob > _impossible(self.log_prob)).sum(0).clamp_min(1)
-        return (number / len(self.log_prob)).to(self.log_prob.dtype).log()
+        return 0.0, self.auto_entropy()
 
     def divergence_bound(self, target_kl: float) -> float:
         """In nats, as it is given."""

@@ -147,6 +147,8 @@ class ActorCriticLoss(PolicyLoss):
 
     takes_choices_only: ClassVar[bool] = False
     """Whether the policy must be over one of n actions."""
+    target_entropy_weight: float = 0.98
+    """Of log n, the part that ``target_entropy="auto"`` asks of a policy over n actions."""
     has_soft_value: ClassVar[bool] = True
     """Whether a state is worth its soft value (Eq. 8), or else the reference's mean of Q."""
 
@@ -498,7 +500,7 @@ class ActorCriticLoss(PolicyLoss):
         if self.target_entropy is not None:
             if self.target_entropy != self._reachable and values_can_be_seen():
                 self._check_target_entropy(actions, states.reference, reduction)
-            excess = actions.entropy_target(self.target_entropy) - metrics["entropy"]
+            excess = self._entropy_asked_for(actions) - metrics["entropy"]
             losses["loss_tau_prime"] = self.dual("tau_prime", excess, reduction.mean(excess))
         return losses
 
@@ -821,7 +823,7 @@ class ActorCriticLoss(PolicyLoss):
         is_empty = reduction.mask is not None and not reduction.mask.any()
         if target is None or is_empty or (target == "auto" and not self._reads_action):
             return  # "auto" follows the mask
-        value, (low, high) = actions.entropy_target(target), actions.entropy_range(reference)
+        value, (low, high) = self._entropy_asked_for(actions), actions.entropy_range(reference)
         bound = float(reduction.mean(high))
         if not low < value < bound:
             raise ValueError(
@@ -829,6 +831,12 @@ class ActorCriticLoss(PolicyLoss):
                 f"these states: their actions leave {low:.3g} to {bound:.3g}. Lower or raise it."
             )
         self._reachable = target
+
+    def _entropy_asked_for(self, actions: Actions) -> Any:
+        if self.target_entropy != "auto":
+            return self.target_entropy
+        auto = actions.auto_entropy()
+        return auto if self._reads_action else self.target_entropy_weight * auto
 
     def _explain(self, error: Exception, transitions: TensorDictBase) -> None:
         """Name the entry, or the parameter, that an error comes from, if there is one."""

@@ -10,7 +10,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
 from torch.distributions import Distribution
 
-from torchrl_ecpo.checks import as_fraction, check_choice, check_count
+from torchrl_ecpo.checks import as_fraction, as_share, check_choice, check_count
 from torchrl_ecpo.functional import (
     Surrogate,
     centred_gaussian_projection,
@@ -267,9 +267,10 @@ class DiscreteECACLoss(ECACLoss):
     Keyword Args:
         tau_prime: default: 0.1.
         target_kl: KL(target, pi_bar) in nats that tau is learned to hold. Default: 0.1.
-        target_entropy: ``"auto"`` is 0.98 log n, that of TorchRL's ``DiscreteSACLoss``. Default:
-            None, a fixed tau_prime. n is the number of actions that a mask leaves; other targets
-            lie between 0 and its logarithm.
+        target_entropy: ``"auto"`` is log n times `target_entropy_weight`, as in TorchRL's
+            ``DiscreteSACLoss``. Default: None, a fixed tau_prime. n is the number of actions that a
+            mask leaves; other targets lie between 0 and its logarithm.
+        target_entropy_weight: between 0 and 1. Default: 0.98, TorchRL's.
 
     Raises:
         ValueError: as :class:`ECACLoss` and, when called, for a `target_entropy` that the actions
@@ -303,6 +304,7 @@ class DiscreteECACLoss(ECACLoss):
         tau_prime: float = 0.1,
         target_kl: float | None = 0.1,
         target_entropy: float | Literal["auto"] | None = None,
+        target_entropy_weight: float = 0.98,
         projection: Literal["paper"] = "paper",
         **options: Any,
     ) -> None:
@@ -316,3 +318,4 @@ class DiscreteECACLoss(ECACLoss):
             projection=projection,
             **options,
         )
+        self.target_entropy_weight = as_share("target_entropy_weight", target_entropy_weight)

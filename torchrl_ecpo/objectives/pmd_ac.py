@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 
+from torchrl_ecpo.checks import as_share
 from torchrl_ecpo.functional import Surrogate
 from torchrl_ecpo.objectives.actions import AllActions, actions_of
 from torchrl_ecpo.objectives.actor_critic import ActorCriticLoss, States
@@ -109,6 +110,7 @@ class DiscretePMDACLoss(PMDACLoss):
     Keyword Args:
         tau_prime: default: 0.1.
         target_entropy: default: None, a fixed tau_prime.
+        target_entropy_weight: default: 0.98.
 
     Raises:
         ValueError: as :class:`~torchrl_ecpo.DiscreteECACLoss`.
@@ -135,6 +137,7 @@ class DiscretePMDACLoss(PMDACLoss):
         *,
         tau_prime: float = 0.1,
         target_entropy: float | Literal["auto"] | None = None,
+        target_entropy_weight: float = 0.98,
         **options: Any,
     ) -> None:
         super().__init__(
@@ -145,3 +148,4 @@ class DiscretePMDACLoss(PMDACLoss):
             target_entropy=target_entropy,
             **options,
         )
+        self.target_entropy_weight = as_share("target_entropy_weight", target_entropy_weight)
