@@ -7,7 +7,6 @@ thing after another.
 
 from __future__ import annotations
 
-import math
 import multiprocessing
 import os
 import signal
@@ -272,7 +271,7 @@ class _Process(_Worker):
         self._pool.shutdown(wait=False, cancel_futures=True)
         self._exit_code(0.5)
         self.process.kill()
-        self._exit_code(math.inf)
+        self._exit_code(5.0)
 
     def _exit_code(self, seconds: float) -> int | None:
         """The exit code, waited for. A join returns at once where the pool's thread joins."""
