@@ -56,8 +56,8 @@ ORANGE, SKY, PURPLE, BROWN = "#E69F00", "#56B4E9", "#7B5FD0", "#9C6240"
 COLOURS = (BLUE, GREEN, RED, PINK, ORANGE, SKY, PURPLE, BROWN)
 """Those that are given to methods without one in the table."""
 METHOD_COLOURS = {
-    **dict.fromkeys(("ecpo", "ecac", "centred", "centredscale", "meanseeking"), BLUE),
-    **dict.fromkeys(("urex", "sac", "noprojection", "referencekept"), GREEN),
+    **dict.fromkeys(("ecpo", "ecac", "ecacphi04", "centred", "centredscale", "meanseeking"), BLUE),
+    **dict.fromkeys(("urex", "sac", "sacphi04", "noprojection", "referencekept"), GREEN),
     **dict.fromkeys(("ment", "td3", "tau0"), RED),
     **dict.fromkeys(("tpo", "ddpg", "plainreturns", "eq11"), PINK),
     **dict.fromkeys(("drgrpo", "grpo", "freshbatches", "k5andm5"), ORANGE),
