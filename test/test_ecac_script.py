@@ -161,7 +161,7 @@ def test_evaluation_does_not_disturb_training(sweep, tmp_path, train):
     "options",
     [
         (
-            *("env=hopper", "replay_buffer.storage=memmap"),
+            *("env=hopper", "replay_buffer.storage=memmap", "critic=layer_norm"),
             *("loss.projection=gradient", "loss.width_entropy=0.4"),
         ),
         (

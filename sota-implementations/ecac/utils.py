@@ -162,7 +162,7 @@ def make_actor(config: DictConfig, env: EnvBase) -> TensorDictModuleBase:
 def make_loss(config: DictConfig, actor: TensorDictModuleBase, env: EnvBase) -> LossModule:
     """The loss that ``loss=`` names, with its critics."""
     action_spec: Any = env.action_spec_unbatched
-    sizes = {"hidden_sizes": config.hidden_sizes}
+    sizes = {"hidden_sizes": config.hidden_sizes, "layer_norm": config.critic == "layer_norm"}
     if isinstance(action_spec, Categorical):
         critics = [make_action_value_network(_observation_size(env), action_spec.n, **sizes)]
     else:

@@ -49,6 +49,7 @@ IMPLIED = {
     "epochs": 1,
     "max_kl": "None",
     "loss.width_entropy": 1.0,
+    "critic": "plain",
     # Of what is not learned, which had none.
     "optim.lr.log_tau": 0.01,
     "optim.lr.log_tau_prime": 0.0003,

@@ -166,8 +166,9 @@ SUBJECTS = {
             "sizes": (5, 7, 4),
             "head": lambda x: x.chunk(2, -1),
             "final_gain": 0.5,
+            "layer_norm": True,
         },
-        optional=["final_gain"],
+        optional=["final_gain", "layer_norm"],
     ),
     "DenseNetwork.forward": Subject(
         read(lambda: make_qvalue_network(3, 2, hidden_sizes=(5,)), (4,)),
@@ -193,15 +194,15 @@ SUBJECTS = {
     ),
     "make_qvalue_network": Subject(
         build(make_qvalue_network, observation=OBSERVATION, action=ACTION),
-        {"observation_size": 3, "action_size": 2, "hidden_sizes": (5, 6)},
+        {"observation_size": 3, "action_size": 2, "hidden_sizes": (5, 6), "layer_norm": True},
         fine=NO_LAYERS,
-        optional=["hidden_sizes"],
+        optional=["hidden_sizes", "layer_norm"],
     ),
     "make_value_network": Subject(
         build(make_value_network, observation=OBSERVATION),
-        {"observation_size": 3, "hidden_sizes": (5, 6)},
+        {"observation_size": 3, "hidden_sizes": (5, 6), "layer_norm": True},
         fine=NO_LAYERS,
-        optional=["hidden_sizes"],
+        optional=["hidden_sizes", "layer_norm"],
     ),
     "make_softmax_policy": Subject(
         build(make_softmax_policy, observation=torch.ones(4, 1)),

@@ -42,9 +42,13 @@ def copy_weights(network, mlp):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("hidden", [[], [8], [8, 5]])
-def test_a_dense_network_computes_what_an_mlp_does(hidden, dtype):
-    network = DenseNetwork(["a", "b"], ["out"], [5, *hidden, 2]).to(dtype)
-    mlp = MLP(in_features=5, out_features=2, num_cells=hidden, activation_class=nn.ReLU).to(dtype)
+@pytest.mark.parametrize("is_normal", [False, True])
+def test_a_dense_network_computes_what_an_mlp_does(hidden, dtype, is_normal):
+    network = DenseNetwork(["a", "b"], ["out"], [5, *hidden, 2], layer_norm=is_normal).to(dtype)
+    norms = [{"normalized_shape": units, "elementwise_affine": False} for units in hidden]
+    norm = {"norm_class": nn.LayerNorm, "norm_kwargs": norms} if is_normal else {}
+    options = {"num_cells": hidden, "activation_class": nn.ReLU, **norm}
+    mlp = MLP(in_features=5, out_features=2, **options).to(dtype)
     copy_weights(network, mlp)
     td = TensorDict(
         {"a": torch.randn(4, 7, 3, dtype=dtype), "b": torch.randn(4, 7, 2, dtype=dtype)}, [4, 7]

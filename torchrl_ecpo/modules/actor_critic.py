@@ -23,6 +23,7 @@ from tensordict.nn import (
 )
 from torch import Tensor, nn
 from torch.distributions import Categorical
+from torch.nn.functional import layer_norm as normalise
 from torch.nn.functional import linear
 from torchrl.data import Bounded, TensorSpec
 from torchrl.data import Categorical as CategoricalSpec
@@ -33,6 +34,7 @@ from torchrl_ecpo.checks import (
     as_float,
     check_count,
     check_counts,
+    check_flag,
     check_keys,
     check_kind,
     names_entries,
@@ -71,6 +73,8 @@ class DenseNetwork(TensorDictModuleBase):
 
     Keyword Args:
         final_gain: factor of the last layer's parameters at the start. Default: 1.
+        layer_norm: whether what goes into each ReLU is normalised over its units, to mean 0 and
+            variance 1, as ``torch.nn.LayerNorm`` does without parameters. Default: False.
 
     Raises:
         TypeError: if keys are no lists of names, or ``head`` is no function.
@@ -92,6 +96,7 @@ class DenseNetwork(TensorDictModuleBase):
         head: Callable[[Tensor], tuple[Tensor, ...]] | None = None,
         *,
         final_gain: float = 1.0,
+        layer_norm: bool = False,
     ) -> None:
         super().__init__()
         if not 0 <= as_float("final_gain", final_gain) < math.inf:
@@ -107,6 +112,7 @@ class DenseNetwork(TensorDictModuleBase):
             check_kind("head", head, Callable)
         self.head = head
         self.final_gain = final_gain
+        self.layer_norm = check_flag("layer_norm", layer_norm)
         self._names = [name for i in range(len(sizes) - 1) for name in (f"weight_{i}", f"bias_{i}")]
         for weight, bias, fan_in, fan_out in self._layers():
             self.register_parameter(weight, nn.Parameter(torch.empty(fan_out, fan_in)))
@@ -131,7 +137,7 @@ class DenseNetwork(TensorDictModuleBase):
         """Write the outputs into ``tensordict``."""
         parameters = [getattr(self, name) for name in self._names]
         inputs = torch.cat([tensordict.get(key) for key in self.in_keys], -1)
-        return self._write(_compute([inputs], parameters), tensordict)
+        return self._write(_compute([inputs], parameters, self.layer_norm), tensordict)
 
     @names_entries
     def each(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
@@ -167,7 +173,7 @@ class DenseNetwork(TensorDictModuleBase):
         else:
             inputs = [torch.cat(inputs, -1)]
         sets = zip(*(params.get(name).unbind(0) for name in self._names), strict=True)
-        outputs = [_compute(inputs, parameters) for parameters in sets]
+        outputs = [_compute(inputs, parameters, self.layer_norm) for parameters in sets]
         return self._write(torch.stack(outputs), TensorDict())
 
     def _layers(self) -> Iterator[tuple[str, str, int, int]]:
@@ -183,7 +189,7 @@ class DenseNetwork(TensorDictModuleBase):
         return tensordict
 
 
-def _compute(inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:
+def _compute(inputs: Sequence[Tensor], parameters: Sequence[Tensor], is_normal: bool) -> Tensor:
     """Of inputs side by side; the first layer multiplies once what is ``[1, ...]``."""
     (weight, bias), *others = zip(parameters[::2], parameters[1::2], strict=True)
     if len(inputs) == 1:
@@ -195,6 +201,8 @@ def _compute(inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:
         own = [x for x in products if len(x) > 1]
         x = sum(own[1:], own[0]).add_(shared)
     for weight, bias in others:
+        if is_normal:
+            x = normalise(x, x.shape[-1:])
         x = linear(x.relu_(), weight, bias)  # what goes into ReLU is read by nobody else
     return x
 
@@ -303,6 +311,7 @@ def make_qvalue_network(
     action_size: int,
     *,
     hidden_sizes: Sequence[int] = HIDDEN_SIZES,
+    layer_norm: bool = False,
 ) -> TensorDictModuleBase:
     """Q(s, a): reads ``observation`` and ``action``, writes ``state_action_value`` ``[..., 1]``.
 
@@ -310,6 +319,7 @@ def make_qvalue_network(
         observation_size: length of an observation vector, or ``(C, H, W)`` of pixels.
         action_size: length A of an action vector.
         hidden_sizes: units of each hidden layer. Default: (256, 256).
+        layer_norm: as of :class:`DenseNetwork`. Default: False.
 
     Examples:
         >>> import torch
@@ -318,24 +328,35 @@ def make_qvalue_network(
         torch.Size([5, 1])
     """
     size = check_count("action_size", action_size)
-    return _network(observation_size, ["state_action_value"], hidden_sizes, 1, action_size=size)
+    return _network(
+        observation_size,
+        ["state_action_value"],
+        hidden_sizes,
+        1,
+        action_size=size,
+        layer_norm=layer_norm,
+    )
 
 
 def make_value_network(
-    observation_size: int | Sequence[int], *, hidden_sizes: Sequence[int] = HIDDEN_SIZES
+    observation_size: int | Sequence[int],
+    *,
+    hidden_sizes: Sequence[int] = HIDDEN_SIZES,
+    layer_norm: bool = False,
 ) -> TensorDictModuleBase:
     """V(s): reads ``observation``, writes ``state_value`` ``[..., 1]``.
 
     Args:
         observation_size: length of an observation vector, or ``(C, H, W)`` of pixels.
         hidden_sizes: units of each hidden layer. Default: (256, 256).
+        layer_norm: as of :class:`DenseNetwork`. Default: False.
 
     Examples:
         >>> import torch
         >>> make_value_network(3)(observation=torch.zeros(5, 3)).shape
         torch.Size([5, 1])
     """
-    return _network(observation_size, ["state_value"], hidden_sizes, 1)
+    return _network(observation_size, ["state_value"], hidden_sizes, 1, layer_norm=layer_norm)
 
 
 def make_categorical_actor(
@@ -381,6 +402,7 @@ def make_action_value_network(
     num_actions: int,
     *,
     hidden_sizes: Sequence[int] = HIDDEN_SIZES,
+    layer_norm: bool = False,
 ) -> TensorDictModuleBase:
     """Q(s, .): reads ``observation``, writes ``action_value`` ``[..., n]``, of each of n actions.
 
@@ -388,6 +410,7 @@ def make_action_value_network(
         observation_size: length of an observation vector, or ``(C, H, W)`` of pixels.
         num_actions: n.
         hidden_sizes: units of each hidden layer. Default: (256, 256).
+        layer_norm: as of :class:`DenseNetwork`. Default: False.
 
     Examples:
         >>> import torch
@@ -395,7 +418,7 @@ def make_action_value_network(
         torch.Size([5, 4])
     """
     size = check_count("num_actions", num_actions)
-    return _network(observation_size, ["action_value"], hidden_sizes, size)
+    return _network(observation_size, ["action_value"], hidden_sizes, size, layer_norm=layer_norm)
 
 
 def _network(
