@@ -38,7 +38,7 @@ TINY = (
     "replay_buffer.batch_size=32",
     "loss.num_actor_states=16",
 )
-LOSSES = ("ecac", "pmd_ac", "mpo", "sac", "sac_score", "td3", "ddpg")
+LOSSES = ("ecac", "pmd_ac", "mpo", "sac", "sac_score", "tqc", "td3", "ddpg")
 
 
 def start(directory, *overrides):

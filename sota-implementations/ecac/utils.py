@@ -29,7 +29,14 @@ from torchrl.envs import (
     TransformedEnv,
 )
 from torchrl.modules import AdditiveGaussianModule
-from torchrl.objectives import DDPGLoss, DiscreteSACLoss, LossModule, TargetNetUpdater, TD3Loss
+from torchrl.objectives import (
+    DDPGLoss,
+    DiscreteSACLoss,
+    LossModule,
+    TargetNetUpdater,
+    TD3Loss,
+    TQCLoss,
+)
 from width_sac import WidthSACLoss
 
 from torchrl_ecpo import (
@@ -68,6 +75,7 @@ LOSSES = {
     "mpo": MPOLoss,
     "sac": WidthSACLoss,
     "sac_score": ScoreSACLoss,
+    "tqc": TQCLoss,
     "td3": TD3Loss,
     "ddpg": DDPGLoss,
 }
@@ -85,6 +93,7 @@ OF_THE_SCRIPT = [
     "exploration",
     "policy_delay",
     "reference_interval",
+    "num_quantiles",
 ]
 TEMPERATURES = ("tau", "tau_prime")
 SHOWN = ("evaluation_return", "return", "entropy", "alpha", "tau", "tau_prime", "steps_per_second")
@@ -166,7 +175,9 @@ def make_loss(config: DictConfig, actor: TensorDictModuleBase, env: EnvBase) -> 
     if isinstance(action_spec, Categorical):
         critics = [make_action_value_network(_observation_size(env), action_spec.n, **sizes)]
     else:
-        critics = [make_qvalue_network(_observation_size(env), action_spec.shape[-1], **sizes)]
+        outputs = {"num_outputs": config.loss.get("num_quantiles", 1)}
+        actions = action_spec.shape[-1]
+        critics = [make_qvalue_network(_observation_size(env), actions, **sizes, **outputs)]
     if config.loss.value_network:
         critics.append(make_value_network(_observation_size(env), **sizes))
     options = {str(k): value for k, value in config.loss.items() if k not in OF_THE_SCRIPT}
@@ -183,7 +194,7 @@ def make_loss(config: DictConfig, actor: TensorDictModuleBase, env: EnvBase) -> 
         options["noise_clip"] *= _half_range(action_spec)
     if config.loss.name == "discrete_sac":
         options["num_actions"] = action_spec.n
-    if config.loss.name in ("sac", "discrete_sac", "sac_score", "td3"):
+    if config.loss.name in ("sac", "discrete_sac", "sac_score", "td3", "tqc"):
         options["deactivate_vmap"] = True  # the faster way on a CPU; the numbers are the same
     loss_module = LOSSES[config.loss.name](actor, *critics, **options)
     loss_module.make_value_estimator(gamma=config.gamma)

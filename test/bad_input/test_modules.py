@@ -194,9 +194,15 @@ SUBJECTS = {
     ),
     "make_qvalue_network": Subject(
         build(make_qvalue_network, observation=OBSERVATION, action=ACTION),
-        {"observation_size": 3, "action_size": 2, "hidden_sizes": (5, 6), "layer_norm": True},
+        {
+            "observation_size": 3,
+            "action_size": 2,
+            "hidden_sizes": (5, 6),
+            "layer_norm": True,
+            "num_outputs": 1,
+        },
         fine=NO_LAYERS,
-        optional=["hidden_sizes", "layer_norm"],
+        optional=["hidden_sizes", "layer_norm", "num_outputs"],
     ),
     "make_value_network": Subject(
         build(make_value_network, observation=OBSERVATION),

@@ -312,14 +312,17 @@ def make_qvalue_network(
     *,
     hidden_sizes: Sequence[int] = HIDDEN_SIZES,
     layer_norm: bool = False,
+    num_outputs: int = 1,
 ) -> TensorDictModuleBase:
-    """Q(s, a): reads ``observation`` and ``action``, writes ``state_action_value`` ``[..., 1]``.
+    """Q(s, a): reads ``observation`` and ``action``, writes ``state_action_value`` ``[..., n]``.
 
     Args:
         observation_size: length of an observation vector, or ``(C, H, W)`` of pixels.
         action_size: length A of an action vector.
         hidden_sizes: units of each hidden layer. Default: (256, 256).
         layer_norm: as of :class:`DenseNetwork`. Default: False.
+        num_outputs: n, the value (1, the default) or that many quantiles of the return, which
+            TorchRL's ``TQCLoss`` reads.
 
     Examples:
         >>> import torch
@@ -328,14 +331,9 @@ def make_qvalue_network(
         torch.Size([5, 1])
     """
     size = check_count("action_size", action_size)
-    return _network(
-        observation_size,
-        ["state_action_value"],
-        hidden_sizes,
-        1,
-        action_size=size,
-        layer_norm=layer_norm,
-    )
+    options = {"action_size": size, "layer_norm": layer_norm}
+    outputs = check_count("num_outputs", num_outputs)
+    return _network(observation_size, ["state_action_value"], hidden_sizes, outputs, **options)
 
 
 def make_value_network(
