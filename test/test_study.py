@@ -125,7 +125,7 @@ def test_the_study_is_what_was_planned(study):
     names = ("first_bandit", "first_tasks", "figure2")
     reported = {seed for name in names for seed in manifest.studies[name].seeds}
     searches = {n: entry for n, entry in manifest.studies.items() if n.startswith("search")}
-    assert len(searches) == 17
+    assert len(searches) == 19
     for name, search in searches.items():
         assert not reported & set(search.seeds), "searched on the reported seeds"
         cells = [(cell.task.name, cell.method) for cell in manifest.cells(search)]

@@ -69,6 +69,9 @@ METHOD_COLOURS = {
     **dict.fromkeys(("smallstartat3e4", "ofthegroup", "windowoffour"), BLUE),
     **dict.fromkeys(("ofthebatch", "memoryless"), GREEN),
     "ppo": ORANGE,
+    "tqc": RED,
+    **dict.fromkeys(("sacphi04layernorm", "gradientsat3e4"), GREEN),
+    **dict.fromkeys(("ecacphi04layernorm", "gradientsat1e3"), PURPLE),
 }
 """The colour of a method in every picture, by the letters and digits of its name."""
 
