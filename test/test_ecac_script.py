@@ -506,6 +506,31 @@ def test_on_humanoid_ecac_s_policy_alone_starts_small_and_learns_slower(utils):
         assert there.loss == elsewhere.loss
 
 
+@pytest.mark.parametrize(("new", "share"), [(8, 0.25), (6, 0.2), (25, 0.28), (50, 0.58), (8, 1)])
+def test_fractions_of_updates_add_up(utils, new, share):
+    due = [utils.updates_due(frames, new, share) for frames in range(new, 100 * new + 1, new)]
+    assert sum(due) == round(100 * new * share)
+    assert max(due) - min(due) <= 1
+
+
+def test_a_game_goes_on_as_it_would_have(utils):
+    """Its ball and what repeats actions are random by a generator that gymnasium does not know."""
+    pytest.importorskip("minatar")
+    config = configure(["env=minatar"])
+    torch.manual_seed(0)
+    env, other = (utils.make_environment(config, seed=seed) for seed in (1, 2))
+    for _ in range(6):
+        last = env.rollout(5, break_when_any_done=True)[-1]
+    other.load_state_dict(env.state_dict())
+    observations = []
+    for each in (env, other):
+        torch.manual_seed(1)
+        after = each.rollout(50, auto_reset=False, tensordict=last["next"].exclude("reward"))
+        observations.append(after["next", "observation"])
+    assert len(observations[0]) > 1
+    assert torch.equal(*observations)
+
+
 def test_every_asks_once_an_interval(utils):
     every = utils.Every(10)
     assert [count for count in range(4, 60, 4) if every(count)] == [12, 20, 32, 40, 52]

@@ -272,11 +272,6 @@ def test_all_that_does_not_go_together_is_said(refusal):
         ("env=algorithmic", "There is no env=algorithmic; there are bandit, copy"),
         ("ecac env=gym", "ecac.py: env.name must be given.\n"),
         (
-            "ecac env=pendulum updates_per_frame=0.3",
-            "ecac.py: collector.frames_per_batch=8 times updates_per_frame=0.3 must be a whole "
-            "number of updates, got 2.4.\n",
-        ),
-        (
             "env=bandit=1",
             "ecpo.py: env=bandit=1 cannot be read as NAME=VALUE: mismatched input '='",
         ),

@@ -41,6 +41,7 @@ from utils import (
     make_updater,
     mean,
     scalars,
+    updates_due,
 )
 
 from torchrl_ecpo.collectors import shut_down
@@ -129,7 +130,8 @@ def main(config: DictConfig) -> None:
             replay_buffer.extend(transitions.select(*loss_module.in_keys, strict=False))
 
             if progress.frames > config.collector.init_random_frames:
-                for _ in range(int(len(transitions) * config.updates_per_frame)):
+                new = len(transitions)
+                for _ in range(updates_due(progress.frames, new, config.updates_per_frame)):
                     is_policy_due = (progress.updates + 1) % config.loss.policy_delay == 0
                     batch = replay_buffer.sample()
                     # What is compiled is the whole.
@@ -141,7 +143,7 @@ def main(config: DictConfig) -> None:
                     progress.updates += 1
                     if is_policy_due:
                         updater.step()
-                temperatures.step(len(transitions))
+                temperatures.step(new)
                 collector.update_policy_weights_()
 
             is_over = progress.frames >= config.total_frames

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Sequence
@@ -101,12 +102,6 @@ SHOWN = ("evaluation_return", "return", "entropy", "alpha", "tau", "tau_prime", 
 
 def check_config(config: DictConfig, options: Sequence[str] = ()) -> None:
     """Refuse options that do not go together."""
-    batch, per_frame = config.collector.frames_per_batch, config.updates_per_frame
-    if batch * per_frame % 1:
-        raise ValueError(
-            f"collector.frames_per_batch={batch} times updates_per_frame={per_frame} must be a "
-            f"whole number of updates, got {batch * per_frame:g}."
-        )
     with closing(make_environment(config, seed=config.seed)) as env:
         make_actor(config, env)
 
@@ -208,6 +203,12 @@ def compute_losses(
     if isinstance(loss_module, TD3Loss) and not with_policy:
         return TensorDict(loss_qvalue=loss_module.value_loss(batch)[0])
     return loss_module(batch)
+
+
+def updates_due(frames: int, new: int, per_frame: float) -> int:
+    """Updates after the last `new` of so many frames; of fractions the remainders add up."""
+    before, now = (math.floor(round(count * per_frame, 6)) for count in (frames - new, frames))
+    return now - before
 
 
 def make_temperatures(config: DictConfig, loss_module: LossModule) -> TemperatureScheduler:

@@ -44,6 +44,7 @@ class Own(gym.Env):
         (spaces.Box(0, 255, (2,), np.uint8), np.array([51, 255], np.uint8), [0.2, 1]),
         (spaces.Box(-2, 2, (1, 2), np.int64), np.array([[-2, 1]]), [0, 0.75]),
         (spaces.Box(0, 10**6, (1,), np.int64), np.array([300]), [300]),
+        (spaces.Box(np.array([0, 3]), np.array([4, 3]), dtype=np.int64), np.array([3, 3]), [3, 3]),
         pytest.param(
             spaces.Box(-1, 1, (2, 1), np.float16),
             np.array([[1], [-1]], np.float16),
@@ -66,7 +67,7 @@ def test_observations_become_a_vector_of_numbers(space, observation, expected):
     seen, _ = env.reset(seed=0)
     assert isinstance(env.observation_space, spaces.Box)
     assert env.observation_space.contains(seen)
-    assert seen.dtype in (np.float32, np.float64)
+    assert seen.dtype == np.float32
     assert seen.tolist() == pytest.approx(expected)
 
 

@@ -25,6 +25,7 @@ from torchrl.modules import IndependentNormal, MaskedCategorical, TanhNormal, Tr
 from torchrl.modules import OneHotCategorical as TorchRLOneHotCategorical
 
 from torchrl_ecpo.objectives.actions import (
+    AllActions,
     SampledActions,
     gaussian_parameters,
     is_discrete,
@@ -150,3 +151,10 @@ def test_is_discrete(policy, expected):
     assert is_discrete(policy) is expected
     if not isinstance(policy, (Independent, TransformedDistribution)):
         assert is_discrete(type(policy)) is expected
+
+
+def test_forbidden_actions_have_no_part_where_q_is_of_higher_precision():
+    actions = AllActions.of(MaskedCategorical(torch.zeros(3), mask=torch.arange(3) < 2))
+    temperatures = {"tau": torch.tensor(0.0), "tau_prime": torch.tensor(1.0)}
+    log_weights, _ = actions.lift(torch.zeros(3, dtype=torch.float64), **temperatures)
+    assert log_weights.softmax(0).tolist() == [0.5, 0.5, 0.0]

@@ -618,9 +618,15 @@ def test_samples_are_more_rows():
 # ----------------------------------------------------------------------------- masks of actions
 
 
+class _FiniteMask(MaskedCategorical):
+    def __init__(self, logits, mask):
+        super().__init__(logits, mask=mask, neg_inf=-1e9)
+
+
 @pytest.mark.parametrize(
     ("name", "distribution", "tau"),
     [
+        ("discrete_ecac", _FiniteMask, 0.0),
         ("discrete_ecac", MaskedCategorical, 0.75),
         ("discrete_ecac", MaskedOneHotCategorical, 0.0),
         ("discrete_pmd_ac", MaskedOneHotCategorical, 0.75),

@@ -521,6 +521,19 @@ def test_soft_values_of_a_tabular_problem_are_a_fixed_point():
     assert_close(loss(batch)["state_value"], value.mean(), atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize("shape", [(6,), (6, 1)])
+def test_a_single_action_by_its_number(shape):
+    batch = make_batch("categorical")
+    logit, value = (
+        TensorDictModule(nn.Linear(3, 1), ["observation"], [key])
+        for key in ("logits", "action_value")
+    )
+    actor = ProbabilisticActor(logit, ["logits"], distribution_class=Categorical)
+    loss = DiscreteECACLoss(actor, value, target_kl=None, delay_qvalue=False).double()
+    batch["action"] = torch.zeros(shape, dtype=torch.long)
+    assert loss(batch)["entropy"] == 0
+
+
 def test_actions_by_number_and_one_hot():
     """All forms of the same action give the same losses."""
     batch, loss = make_batch("categorical"), DISCRETE.build()

@@ -75,6 +75,24 @@ def test_multipliers_weigh_their_divergence_and_rise_where_it_exceeds_its_bound(
         assert not any(slope.any() for slope in slopes.values())
 
 
+def test_padding_does_not_hold_a_multiplier_at_its_floor():
+    """The four real states exceed the bound; with the 60 that are not, the mean would not."""
+    loss = CASE.build()
+    become(loss, make_networks(seed=2))
+    loss.log_alpha_mean.data.fill_(-20.0)
+    real = make_batch()[:4]
+    padded = torch.cat([real, torch.zeros_like(real).expand(15, 4).reshape(-1)])
+    padded["collector", "mask"] = torch.arange(64) < 4
+    slopes = []
+    for batch in (real, padded):
+        torch.manual_seed(0)
+        outputs = loss(batch)
+        assert outputs["kl_mean"] > 0.01
+        slopes.append(gradients(loss, outputs["loss_alpha_mean"])["log_alpha_mean"])
+    assert slopes[0] < 0
+    assert (slopes[1] < 0).all()
+
+
 def test_a_temperature_at_its_floor_stays_there():
     """Where Q tells nothing, the target is never far: its temperature falls, but not for ever."""
     loss = CASE.build(min_tau=0.5, tau=0.5)

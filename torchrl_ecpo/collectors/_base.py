@@ -138,6 +138,7 @@ class PlayerCollector(BaseCollector):
         frames = check_count("frames", state_dict["frames"], least=0)
         count = check_count("iter", state_dict["iter"], least=-1)
         self._workers.call("load_state_dict", state_dict["players"])
+        self._workers.forget()
         self._frames, self._iter = frames, count
 
     def shutdown(

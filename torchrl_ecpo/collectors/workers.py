@@ -132,6 +132,10 @@ class Workers:
         futures = [self._submit(worker, name, *row) for worker, row in enumerate(rows)]
         return [self._result(worker, future) for worker, future in enumerate(futures)]
 
+    def forget(self) -> None:
+        """Leave out the batches that are under way."""
+        self._playing.clear()
+
     def stop(self, timeout: float | None = None) -> None:
         """Close the players and end the workers, by force after `timeout` seconds (default: 5)."""
         with suppress(ChildProcessError):

@@ -80,7 +80,8 @@ def _with_plain_observations(env: gym.Env) -> gym.Env:
             f"observes an image among other things, {images[0]}, which would lose its shape. Keep "
             "the image alone, or leave it out, with gymnasium.wrappers.FilterObservation.",
         )
-    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+    is_flat = not isinstance(space, spaces.Box) or len(space.shape) != 1
+    if is_flat:
         with suppress(NotImplementedError):  # a space that gymnasium does not know
             env = wrappers.FlattenObservation(env)
     space = env.observation_space
@@ -91,9 +92,13 @@ def _with_plain_observations(env: gym.Env) -> gym.Env:
             "gymnasium.wrappers.TransformObservation.",
         )
     is_integer = not np.issubdtype(space.dtype, np.floating)
-    if is_integer or space.dtype == np.float16:
-        env = wrappers.DtypeObservation(env, np.float32)
-    if is_integer and space.high.max() < 256 and space.low.min() >= -256:
+    is_mixed = is_flat and space.dtype == np.float64  # what gymnasium makes of choices and numbers
+    if is_integer or is_mixed or space.dtype == np.float16:
+        # DtypeObservation warns of the precision of bounds.
+        ends = (np.float32(end) for end in (space.low, space.high))
+        env = wrappers.TransformObservation(env, np.float32, spaces.Box(*ends))
+    is_small = space.high.max() < 256 and space.low.min() >= -256
+    if is_integer and is_small and (space.high > space.low).all():  # it is divided by the range
         env = wrappers.RescaleObservation(env, np.float32(0), np.float32(1))
     return env
 

@@ -16,10 +16,12 @@ from torchrl_ecpo.envs import readable
 
 def open_raw_task(name: str, **options: Any) -> gym.Env:
     """A task of gymnasium by its id, as it is, or an error that names ``env.name``."""
+    is_minatar = name.startswith("MinAtar/")
     try:
-        if name.startswith("MinAtar/"):
+        if is_minatar:
             _register_minatar()
-        return gym.make(name, disable_env_checker=True, **options)
+        env = gym.make(name, disable_env_checker=True, **options)
+        return _Game(env) if is_minatar else env
     except (gym.error.DependencyNotInstalled, ModuleNotFoundError) as error:
         raise missing(f"env.name={name}", error) from error
     except gym.error.Error as error:
@@ -35,6 +37,25 @@ def _register_minatar() -> None:
 
     if "MinAtar/Breakout-v1" not in gym.registry:
         minatar.gym.register_envs()
+
+
+class _Game(gym.Wrapper):
+    """A game of MinAtar that is random by gymnasium's name for it, and begins without a past.
+
+    It draws from a generator of its own, and repeats actions, also the last one before a reset.
+    """
+
+    @property
+    def np_random(self) -> Any:
+        """What the game draws from."""
+        game: Any = self.unwrapped
+        return game.game.random
+
+    def reset(self, **options: Any) -> Any:
+        """Begin an episode."""
+        game: Any = self.unwrapped
+        game.game.last_action = 0
+        return super().reset(**options)
 
 
 def open_task(name: str, window: int = 1, **options: Any) -> gym.Env:

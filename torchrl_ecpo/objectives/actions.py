@@ -196,8 +196,12 @@ class AllActions(NamedTuple):
     def of(cls, distribution: Any) -> AllActions:
         """All actions of a categorical or one-hot policy."""
         log_prob = distribution.logits.log_softmax(-1).movedim(-1, 0)
+        is_out = log_prob == -torch.inf
+        mask = getattr(distribution, "mask", None)
+        if mask is not None:  # TorchRL's, which may fill in what is finite
+            is_out = is_out | ~mask.expand_as(distribution.logits).movedim(-1, 0)
         # Minus infinity times 0 would be NaN.
-        return cls(log_prob.masked_fill(log_prob == -torch.inf, _impossible(log_prob)))
+        return cls(log_prob.masked_fill(is_out, _impossible(log_prob)))
 
     def log_prob_of(self, distribution: Distribution) -> Tensor:
         """Log-probability ``[n, *B]`` under another policy over the same actions."""
@@ -214,7 +218,7 @@ class AllActions(NamedTuple):
         """
         temperatures = {"tau": tau, "tau_prime": tau_prime}
         impossible = _impossible(score)
-        mask = ~(self.log_prob <= impossible)  # NaN is not impossible, but wrong
+        mask = ~(self.log_prob <= _impossible(self.log_prob))  # NaN is not impossible, but wrong
         log_weights = lifted_log_weights(score, self.log_prob, **temperatures) + self.log_prob
         value = soft_value(score, self.log_prob, **temperatures, sample_dim=0, mask=mask)
         return log_weights.where(mask, impossible), value

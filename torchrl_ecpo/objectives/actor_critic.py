@@ -553,7 +553,8 @@ class ActorCriticLoss(PolicyLoss):
         if self._reads_action:
             return qvalues
         action = tensordict.get(self.tensor_keys.action)
-        if action.shape == qvalues.shape[1:]:
+        is_index = qvalues.shape[-1] == 1 and not action.is_floating_point()  # of the one action
+        if action.shape == qvalues.shape[1:] and not is_index:
             is_one = action == 1
             is_strange = (is_one.sum(-1) != 1) | (is_one != (action != 0)).any(-1)
             self._check_action(is_strange, mask, qvalues)

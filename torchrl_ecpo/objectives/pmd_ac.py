@@ -27,7 +27,9 @@ class PMDACLoss(ActorCriticLoss):
     ``tau_prime=0, target_entropy=None`` is the paper's PMD-AC, a positive tau_prime its
     PMD-AC+entropy. At tau = 0 it is SAC.
 
-    Over one of n actions it is (tau + tau') KL(pi, target) itself, summed over all of them.
+    Over one of n actions it is (tau + tau') KL(pi, target) itself, summed over all of them. At
+    tau = 0 the policy's loss is SAC's there too, but a state is worth its soft value, the maximum
+    over policies, where SAC takes that of the policy.
 
     Arguments, errors and outputs are those of :class:`~torchrl_ecpo.ECACLoss` without
     ``projection`` and ``width_entropy``, and with these differences:

@@ -134,7 +134,8 @@ class TrajectoryGroupLoss(PolicyLoss):
     it returns.
 
     ``torch.compile(fullgraph=True)`` takes it with feed-forward actors; with recurrent ones PyTorch
-    and TorchRL break the graph.
+    and TorchRL break the graph. Compiled or mapped over, it looks at no values: give it one-step
+    trajectories with their time, ``[*G, K, 1]``.
 
     Real steps are those that :attr:`loss_mask_key` marks, by default TorchRL's own
     ``("collector", "mask")`` where it is present. A trajectory without a real step is left out of
