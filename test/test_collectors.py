@@ -41,7 +41,11 @@ from torchrl.modules import (
 from torchrl.trainers import Trainer, UpdateWeights
 
 from torchrl_ecpo import ECPOLoss
-from torchrl_ecpo.collectors import TrajectoryGroupCollector, shut_down
+from torchrl_ecpo.collectors import (
+    SupervisedSyncCollector,
+    TrajectoryGroupCollector,
+    shut_down,
+)
 from torchrl_ecpo.envs import GroupedEnv
 from torchrl_ecpo.envs._groups import GroupIdAllocator
 from torchrl_ecpo.groups import TrajectoryGroupSampler, pack_groups, unpack_groups
@@ -639,6 +643,33 @@ def test_an_error_in_a_worker_process_is_raised_here():
     collector = TrajectoryGroupCollector(make, num_groups=2, group_size=3, num_collectors=1)
     with shut_down(collector), pytest.raises(ZeroDivisionError, match="in the rules"):
         next(iter(collector))
+
+
+@pytest.mark.usefixtures("forked_workers")
+def test_what_is_loaded_leaves_out_what_was_under_way():
+    """The workers go on from the state, not with batches that they played before it was loaded."""
+    collector = TrajectoryGroupCollector([Countdown, Countdown], num_groups=2, group_size=3)
+    with shut_down(collector):
+        batches = iter(collector)
+        next(batches)
+        state = collector.state_dict()
+        for _ in range(3):
+            next(batches)
+        collector.load_state_dict(state)
+        firsts = {}
+        for _ in range(2):
+            ids = next(batches)["collector", "traj_ids"].flatten()
+            firsts.setdefault(int(ids[0]) % 2, int(ids[0]))
+    for worker, first in firsts.items():
+        assert first == state["players"][worker]["next_id"] * 2 + worker
+
+
+@pytest.mark.usefixtures("forked_workers")
+def test_workers_that_play_frames_number_their_own_trajectories():
+    collector = SupervisedSyncCollector([partial(GymEnv, "Pendulum-v1")] * 2, frames_per_batch=8)
+    with shut_down(collector):
+        ids = next(iter(collector))["collector", "traj_ids"].tolist()
+    assert ids == [0] * 4 + [1] * 4
 
 
 def test_ray_workers():
