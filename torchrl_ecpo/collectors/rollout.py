@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor, nn
-from torchrl.data import NonTensor
+from torchrl.data import MultiCategorical, NonTensor
 from torchrl.envs import (
     Compose,
     EnvBase,
@@ -233,11 +233,16 @@ class GroupPlayer:
         for key, spec in self.env.full_action_spec.items(True, True):
             action = acted.get(key, None)
             if action is not None and action.shape != spec.shape:
+                mend = (
+                    "It takes an index for each choice, as Independent(Categorical(...), 1) gives."
+                    if isinstance(spec, MultiCategorical)
+                    else "An index (Categorical) goes with "
+                    "GymEnv(..., categorical_action_encoding=True), OneHotCategorical with "
+                    "GymEnv(...)."
+                )
                 raise ValueError(
                     f"The policy writes {key!r} of shape {tuple(action.shape)}, but the action of "
-                    f"the environment is {type(spec).__name__} of shape {tuple(spec.shape)}. An "
-                    "index (Categorical) goes with GymEnv(..., categorical_action_encoding=True), "
-                    "OneHotCategorical with GymEnv(...)."
+                    f"the environment is {type(spec).__name__} of shape {tuple(spec.shape)}. {mend}"
                 )
 
     def _set_inputs(

@@ -133,7 +133,10 @@ class VectorGroupedEnv(SeededGroups):
         try:
             one = make()
         except gym.error.Error as error:
-            raise ValueError(f"env={env!r} is no task of gymnasium: {error}") from error
+            raise ValueError(
+                f"env={env!r} is no task of gymnasium: {error} One that another module registers "
+                "is 'module:Task-v0'; or give a function that makes a copy."
+            ) from error
         check_kind("What env makes", one, gym.Env)
         one.close()
         shown = _read_root("observation", one.observation_space)

@@ -395,8 +395,8 @@ class TrajectoryGroupLoss(PolicyLoss):
         if found.recorded is None:
             raise KeyError(
                 f"The entry {keys.sample_log_prob!r} is missing: the log-probability of each token "
-                "under the policy that drew it. Let the sampler record it, or compute it with "
-                "torchrl_ecpo.llm.record_log_probs(actor, batch), before the first update."
+                "under the policy that drew it. Compute it with torchrl_ecpo.llm.record_log_probs("
+                "actor, batch), before the first update."
             )
         if values_can_be_seen():
             self._check_left(self.loss_mask_key, found.mask)
