@@ -95,8 +95,9 @@ def _with_plain_observations(env: gym.Env) -> gym.Env:
     is_mixed = is_flat and space.dtype == np.float64  # what gymnasium makes of choices and numbers
     if is_integer or is_mixed or space.dtype == np.float16:
         # DtypeObservation warns of the precision of bounds.
-        ends = (np.float32(end) for end in (space.low, space.high))
-        env = wrappers.TransformObservation(env, np.float32, spaces.Box(*ends))
+        low, high = (end.astype(np.float32) for end in (space.low, space.high))
+        single: Any = np.float32
+        env = wrappers.TransformObservation(env, single, spaces.Box(low, high))
     is_small = space.high.max() < 256 and space.low.min() >= -256
     if is_integer and is_small and (space.high > space.low).all():  # it is divided by the range
         env = wrappers.RescaleObservation(env, np.float32(0), np.float32(1))
