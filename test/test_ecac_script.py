@@ -268,7 +268,7 @@ def test_one_discrete_action_has_a_loss_of_its_own(tmp_path, train):
 def test_a_game_of_minatar_and_fewer_updates_than_frames(tmp_path, train):
     pytest.importorskip("minatar")
     game = ("env=minatar", "env.name=MinAtar/Freeway-v1", "loss=discrete_ecac")
-    metrics = train(tmp_path, *game, "loss.target_entropy=auto", "loss.target_entropy_weight=0.3")
+    metrics = train(tmp_path, *game)
     assert metrics["step"][-1] == 240
     assert all(map(math.isfinite, metrics["loss_actor"][1:]))
     (progress,) = tmp_path.glob("checkpoints/*/components/*-progress/state.pt")
