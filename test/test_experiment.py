@@ -60,6 +60,16 @@ def test_a_run_leaves_config_versions_metrics_summary_and_picture(tmp_path, caps
     assert str(tmp_path / "curve.png") in capsys.readouterr().out
 
 
+def test_a_summary_is_of_the_last_run_or_none(tmp_path):
+    """One that goes on beyond its end, and is killed, must not look finished."""
+    with make_run(tmp_path) as run:
+        record(run)
+    longer = make_run(tmp_path)
+    assert (tmp_path / "summary.json").exists()
+    longer.log({"return": 1.0}, step=40)
+    assert not (tmp_path / "summary.json").exists()
+
+
 def test_rows_are_on_disk_as_soon_as_they_are_logged(tmp_path):
     run = make_run(tmp_path)
     run.log({"return": 1.0}, step=10)

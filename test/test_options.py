@@ -96,6 +96,10 @@ def split(options):
         ("checkpoint.keep=0", "checkpoint.keep must be an integer >= 1, got 0."),
         ("checkpoint.interval=-1", "checkpoint.interval must be a number >= 0 or null, got -1."),
         ("checkpoint.max_share=0", "checkpoint.max_share must be a number > 0 and <= 1, got 0."),
+        (
+            "loss=grpo loss.clip_epsilon=[0.2,-1]",
+            r"clip_epsilon\[1\] must be a number >= 0, got -1",
+        ),
         ("ecac gamma=2", "gamma must be a number >= 0 and <= 1, got 2."),
         ("ecac polyak=0", "polyak must be a number > 0 and <= 1, got 0."),
         ("ecac replay_buffer.storage=tape", "must be tensor or memmap, got 'tape'."),
@@ -185,6 +189,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
         "collector=ray +collector.backend_options.ray_init_config.num_cpus=4",
         "ecac loss.target_kl=null loss.tau=0.1 optim.lr.log_tau=1e-3",
         "ecac loss.value_network=true hidden_sizes=[]",
+        "env=copy loss=grpo loss.clip_epsilon=[0.2,0.28]",
         "hydra/launcher=joblib hydra.run.dir='a=b,c' resume='a=b'",
     ],
 )

@@ -44,7 +44,7 @@ def main(config: DictConfig) -> None:
         shown=SHOWN,
     )
     with run, checkpoints.attach(run, progress, model=model, optimizer=optimizer):
-        if progress.batches == 0:
+        if not run.table.rows:
             policy.supervise(config.supervised, Random(f"supervised {config.seed}"))
             run.log(policy.evaluate(config.evaluation), step=0)
         while progress.completions < config.total_completions:

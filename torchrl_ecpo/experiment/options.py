@@ -275,8 +275,9 @@ def _problems_of(
         except ValueError as error:
             yield f"{name}: {error}"
     elif fitting[0] == "a list" and default:
+        usual = default[0] if isinstance(default, list) else default  # of either, such as a clip
         for index, item in enumerate(value):
-            yield from _problems_of(f"{name}[{index}]", item, default[0], kinds, known)
+            yield from _problems_of(f"{name}[{index}]", item, usual, kinds, known)
 
 
 def _kind_of(default: Any) -> str:

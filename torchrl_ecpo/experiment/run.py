@@ -286,6 +286,8 @@ class Run:
             FloatingPointError: as :meth:`check`; what was recorded stays.
         """
         values = {str(name): float(value) for name, value in metrics.items()}
+        # One that is there is of a shorter run before this one.
+        (self.directory / "summary.json").unlink(missing_ok=True)
         self.table.log_metrics(values, step)
         if self._logger is not None:
             self._logger.log_metrics(values, step)
