@@ -737,8 +737,9 @@ def test_the_report_writes_the_committed_sections(study, monkeypatch, tmp_path):
     manifest, page = study.manifest.read_manifests(), (COMMITTED / "study.md").read_text()
     assert page.startswith(study.report.INTRODUCTION)
     quick = ("dm_control", "sensitivity_temperatures")
+    waiting = page.partition("## Without a complete run yet")[2]
     for name, entry in manifest.studies.items():
-        if name in quick or entry.kind == "ranking":
+        if name in quick or (entry.kind == "ranking" and f"(`{name}`)" not in waiting):
             section = study.report.section(
                 entry, study.results.read_cells(manifest, entry), tmp_path
             )
