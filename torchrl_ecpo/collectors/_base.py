@@ -14,7 +14,7 @@ from torchrl.data import ReplayBuffer
 
 from torchrl_ecpo.checks import check_count, check_flag, check_kind, described
 from torchrl_ecpo.collectors.workers import Workers, spawn_seeds
-from torchrl_ecpo.groups import MASK_KEY, unpack_groups
+from torchrl_ecpo.groups import MASK_KEY, TRAJECTORY_KEY, unpack_groups
 
 
 class PlayerCollector(BaseCollector):
@@ -57,13 +57,19 @@ class PlayerCollector(BaseCollector):
         """Collect a batch, which is not counted nor written anywhere."""
         raise NotImplementedError
 
-    def _play(self) -> list[tuple[int, Any]]:
+    def _play(self) -> list[Any]:
         """What the players collect, in the training mode that the policy has now."""
         modes = _modes_of(self._moded)
         if modes != self._modes:
             self._modes = modes
             self._workers.tell("set_training", modes)
-        return self._workers.play()
+        played = self._workers.play()
+        for worker, batch in played:  # each counts its trajectories for itself
+            ids, mask = batch.get(TRAJECTORY_KEY, None), batch.get(MASK_KEY, None)
+            if ids is not None:
+                ids = ids * len(self._workers) + worker
+                batch.set(TRAJECTORY_KEY, ids if mask is None else ids * mask)
+        return [batch for _, batch in played]
 
     def iterator(self) -> Iterator[Any]:
         """Yield batches, or None after each that is written to the replay buffer.

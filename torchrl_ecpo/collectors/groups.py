@@ -20,7 +20,6 @@ from torchrl_ecpo.checks import check_choice, check_count, check_flag, check_gro
 from torchrl_ecpo.collectors._base import PlayerCollector, check_makers
 from torchrl_ecpo.collectors.rollout import GroupPlayer
 from torchrl_ecpo.collectors.workers import Workers
-from torchrl_ecpo.groups import MASK_KEY, TRAJECTORY_KEY
 
 __all__ = ["TrajectoryGroupCollector"]
 
@@ -172,14 +171,11 @@ class TrajectoryGroupCollector(PlayerCollector):
     def rollout(self) -> TensorDictBase:
         """Collect a batch of groups `[G, K, T]`, which is not counted nor written anywhere."""
         played = self._play()
-        for worker, batch in played:  # each counts its trajectories for itself
-            ids = batch[TRAJECTORY_KEY] * len(self._workers) + worker
-            batch.set(TRAJECTORY_KEY, ids * batch[MASK_KEY])
         if len(played) == 1:
-            return played[0][1]
-        num_steps = max(batch.shape[-1] for _, batch in played)
-        padding = [[0, 0, 0, 0, 0, num_steps - batch.shape[-1]] for _, batch in played]
-        parts = [pad(batch, own) for (_, batch), own in zip(played, padding, strict=True)]
+            return played[0]
+        num_steps = max(batch.shape[-1] for batch in played)
+        padding = [[0, 0, 0, 0, 0, num_steps - batch.shape[-1]] for batch in played]
+        parts = [pad(batch, own) for batch, own in zip(played, padding, strict=True)]
         groups: Any = TensorDict.cat(parts)
         return groups
 

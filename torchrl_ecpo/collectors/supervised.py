@@ -14,7 +14,6 @@ from torchrl.envs import EnvBase
 from torchrl_ecpo.checks import check_count, check_kind
 from torchrl_ecpo.collectors._base import PlayerCollector, check_makers
 from torchrl_ecpo.collectors.workers import Workers, set_training
-from torchrl_ecpo.groups import TRAJECTORY_KEY
 
 __all__ = ["SupervisedAsyncCollector", "SupervisedSyncCollector", "shut_down"]
 
@@ -88,14 +87,7 @@ class SupervisedSyncCollector(PlayerCollector):
 
     def rollout(self) -> Any:
         """Collect a batch of frames `[B]`, worker by worker."""
-        return TensorDict.cat([self._with_own_ids(*played) for played in self._play()])
-
-    def _with_own_ids(self, worker: int, frames: TensorDictBase) -> TensorDictBase:
-        """Frames ``[B]``; each worker counts its trajectories from 0."""
-        ids = frames.get(TRAJECTORY_KEY, None)
-        if ids is not None:
-            frames = frames.copy().set(TRAJECTORY_KEY, ids * len(self._workers) + worker)
-        return frames.reshape(-1)
+        return TensorDict.cat([frames.reshape(-1) for frames in self._play()])
 
 
 class SupervisedAsyncCollector(SupervisedSyncCollector):
