@@ -16,12 +16,9 @@ from torchrl_ecpo.envs import readable
 
 def open_raw_task(name: str, **options: Any) -> gym.Env:
     """A task of gymnasium by its id, as it is, or an error that names ``env.name``."""
-    is_minatar = name.startswith("MinAtar/")
+    make = _make_game if name.startswith("MinAtar/") else gym.make
     try:
-        if is_minatar:
-            _register_minatar()
-        env = gym.make(name, disable_env_checker=True, **options)
-        return _Game(env) if is_minatar else env
+        return make(name, disable_env_checker=True, **options)
     except (gym.error.DependencyNotInstalled, ModuleNotFoundError) as error:
         raise missing(f"env.name={name}", error) from error
     except gym.error.Error as error:
@@ -31,12 +28,13 @@ def open_raw_task(name: str, **options: Any) -> gym.Env:
         ) from error
 
 
-def _register_minatar() -> None:
-    """Let gymnasium know MinAtar's games, which their package does when it is asked only."""
+def _make_game(name: str, **options: Any) -> gym.Env:
+    """A game of MinAtar, whose package lets gymnasium know of it when it is asked only."""
     import minatar.gym
 
     if "MinAtar/Breakout-v1" not in gym.registry:
         minatar.gym.register_envs()
+    return _Game(gym.make(name, **options))
 
 
 class _Game(gym.Wrapper):
