@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import fcntl
 import json
 import math
 import re
@@ -10,7 +11,8 @@ import pytest
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
-from torchrl_ecpo.experiment import MetricsTable, Run, read_metrics
+from torchrl_ecpo.experiment import MetricsTable, Run, leaving_nothing, read_metrics
+from torchrl_ecpo.experiment import run as run_module
 from torchrl_ecpo.experiment.compare import Comparison, find_runs, load_comparison
 from torchrl_ecpo.experiment.compare import main as compare
 from torchrl_ecpo.experiment.figures import draw_curve, plot_learning_curve
@@ -58,6 +60,19 @@ def test_a_run_leaves_config_versions_metrics_summary_and_picture(tmp_path, caps
     assert (summary["return"], summary["evaluation"]) == (4, 5)
     assert (tmp_path / "curve.png").read_bytes().startswith(PNG)
     assert str(tmp_path / "curve.png") in capsys.readouterr().out
+
+
+def test_one_process_makes_a_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run_module, "PATIENCE", 0)
+    main = leaving_nothing(lambda config: make_run(tmp_path, config).__exit__(None, None, None))
+    with (tmp_path / ".lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # as the other process
+        with pytest.raises(SystemExit, match=f"{tmp_path} is in use: another process makes this"):
+            main(make_config())
+        assert [path.name for path in tmp_path.iterdir()] == [".lock"]
+    main(make_config())
+    assert (tmp_path / "config.yaml").exists()
 
 
 def test_a_summary_is_of_the_last_run_or_none(tmp_path):

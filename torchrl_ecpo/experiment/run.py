@@ -20,6 +20,7 @@ from functools import wraps
 from pathlib import Path
 from typing import Any
 
+from filelock import BaseFileLock, FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from hydra.utils import to_absolute_path
@@ -38,7 +39,9 @@ __all__ = ["METRICS_FILE", "MetricsTable", "Run", "leaving_nothing", "read_metri
 
 METRICS_FILE = "metrics.csv"
 """Name of the record in the directory of a run."""
-BEGUN = {"config.yaml", "versions.json", "command.txt"}
+LOCK = ".lock"
+PATIENCE = 5.0  # seconds that what a killed run has left behind may hold its lock
+BEGUN = {"config.yaml", "versions.json", "command.txt", LOCK}
 BACKENDS = ("csv", "tensorboard", "wandb")
 RECORDED_PACKAGES = ("torchrl-ecpo", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
 
@@ -376,11 +379,13 @@ def leaving_nothing(main: Callable[[DictConfig], None]) -> Callable[[DictConfig]
     """A script's ``main`` that leaves nothing behind if it fails before a run has its first row.
 
     What is wrong with the options is then said in one line; HYDRA_FULL_ERROR=1 has the traceback.
+    A directory in which another process makes a run is refused, and left as it is.
     """
 
     @wraps(main)
     def run(config: DictConfig) -> None:
         before = _present()
+        lock = _lock(Path.cwd())
         try:
             main(config)
         except (ValueError, LookupError, OSError, ImportError, CheckpointError) as error:
@@ -389,9 +394,28 @@ def leaving_nothing(main: Callable[[DictConfig], None]) -> Callable[[DictConfig]
             if has_begun or not is_alone or "HYDRA_FULL_ERROR" in os.environ:
                 raise
             message = error.args[0] if isinstance(error, KeyError) else error
-            raise SystemExit(f"{Path(sys.argv[0]).name}: {message}") from None
+            raise SystemExit(f"{_script()}: {message}") from None
+        finally:
+            lock.release()
 
     return run
+
+
+def _script() -> str:
+    return Path(sys.argv[0]).name
+
+
+def _lock(directory: Path) -> BaseFileLock:
+    """Held until it is released or the process ends, whatever ends it."""
+    lock = FileLock(directory / LOCK, timeout=PATIENCE)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise SystemExit(
+            f"{_script()}: {directory} is in use: another process makes this run. Wait until it "
+            "has ended, or stop it; the same command then goes on."
+        ) from None
+    return lock
 
 
 def _present() -> set[Path]:
