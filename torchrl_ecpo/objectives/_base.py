@@ -172,7 +172,7 @@ class PolicyLoss(LossModule):
         names = dict.fromkeys((*self.temperature_names, *self._learned))
         return {name: self.temperature(name) for name in names}
 
-    def dual(self, name: str, excess: Tensor, mean_excess: Tensor | None = None) -> Tensor:
+    def dual(self, name: str, excess: Tensor, mask: Tensor | None = None) -> Tensor:
         """Loss of a learned temperature: up where a constraint is exceeded, else down.
 
         At its floor a temperature is not sent further down: it would take long to return. (To clamp
@@ -181,14 +181,13 @@ class PolicyLoss(LossModule):
         Args:
             name: of the temperature.
             excess: ``[*B]``, by how much the constraint is exceeded.
-            mean_excess: 0-d, its mean over the real states, by default over all of them: it says
-                where the temperature is sent.
+            mask: ``[*B]``, True where a state is real; None: all are.
 
         Returns:
             ``[*B]``, :func:`~torchrl_ecpo.functional.temperature_dual`.
         """
         log_temperature: Tensor = getattr(self, f"log_{name}")
-        mean_excess = excess.mean() if mean_excess is None else mean_excess
+        mean_excess = Reduction("mean", excess.shape, mask).mean(excess)
         is_at_floor = log_temperature.detach() <= math.log(self._learned[name][0])
         excess = excess.masked_fill(is_at_floor & (mean_excess < 0), 0)
         return temperature_dual(log_temperature, excess)

@@ -496,12 +496,12 @@ class ActorCriticLoss(PolicyLoss):
         if self.target_kl is not None:
             bound = actions.divergence_bound(self.target_kl)
             excess = ((reduction.mean(metrics["kl_target_reference"]) - bound) / bound).clamp(-1, 1)
-            losses["loss_tau"] = self.dual("tau", excess.expand(reduction.shape), excess)
+            losses["loss_tau"] = self.dual("tau", excess.expand(reduction.shape), states.mask)
         if self.target_entropy is not None:
             if self.target_entropy != self._reachable and values_can_be_seen():
                 self._check_target_entropy(actions, states.reference, reduction)
             excess = self._entropy_asked_for(actions) - metrics["entropy"]
-            losses["loss_tau_prime"] = self.dual("tau_prime", excess, reduction.mean(excess))
+            losses["loss_tau_prime"] = self.dual("tau_prime", excess, states.mask)
         return losses
 
     # ------------------------------------------------------------------------------- the critics

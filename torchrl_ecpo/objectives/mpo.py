@@ -7,11 +7,10 @@ from typing import Any, Literal
 
 import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
-from torch import Tensor
 from torch.distributions import Normal, kl_divergence
 
 from torchrl_ecpo.checks import as_float
-from torchrl_ecpo.functional import Surrogate, masked_mean, mean_seeking_projection
+from torchrl_ecpo.functional import Surrogate, mean_seeking_projection
 from torchrl_ecpo.objectives.actions import SampledActions, gaussian_parameters
 from torchrl_ecpo.objectives.actor_critic import ActorCriticLoss, States
 
@@ -147,7 +146,7 @@ class MPOLoss(ActorCriticLoss):
         old_loc, old_scale = (x.detach() for x in gaussian_parameters(states.reference))
         reference = Normal(old_loc, old_scale, validate_args=False)
         divergence = actions.divergence_of(lift.weights, lift.log_weights)
-        losses = {"loss_tau": self._dual_of("tau", divergence / bound["epsilon"], states)}
+        losses = {"loss_tau": self.dual("tau", divergence / bound["epsilon"] - 1, states.mask)}
         loss, metrics = torch.zeros_like(divergence), {}
         for name, parameters in {"mean": (loc, old_scale), "scale": (old_loc, scale)}.items():
             part = Normal(*parameters, validate_args=False)
@@ -155,13 +154,7 @@ class MPOLoss(ActorCriticLoss):
             log_prob = part.log_prob(actions.latent).sum(-1)
             fit = mean_seeking_projection(log_prob, lift.log_weights, sample_dim=0).loss
             loss = loss + fit + self.temperature(alpha) * divergence
-            share = divergence / bound[f"epsilon_{name}"]
-            losses[f"loss_{alpha}"] = self._dual_of(alpha, share, states)
+            excess = divergence / bound[f"epsilon_{name}"] - 1
+            losses[f"loss_{alpha}"] = self.dual(alpha, excess, states.mask)
             metrics |= {f"kl_{name}": divergence, alpha: self.temperature(alpha)}
         return Surrogate(loss, lift.weights, losses, metrics)
-
-    def _dual_of(self, name: str, share: Tensor, states: States) -> Tensor:
-        """The loss of a multiplier, from the divergence ``[*B]`` as a share of its bound."""
-        excess = share - 1
-        mask = None if states.mask is None else states.mask.flatten()
-        return self.dual(name, excess, masked_mean(excess.detach().flatten(), mask=mask))
