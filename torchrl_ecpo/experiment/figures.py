@@ -96,11 +96,9 @@ def smooth(values: np.ndarray, fraction: float = 0.02) -> np.ndarray:
     fraction = as_fraction("fraction, of the smoothing,", fraction)
     window = max(int(len(values) * fraction), 1)
     if window == 1:
-        return values  # a difference of sums would lose digits
-    sums = np.cumsum(np.concatenate([np.zeros(1), values]))
-    ends = np.arange(1, len(values) + 1)
-    starts = np.maximum(ends - window, 0)
-    return (sums[ends] - sums[starts]) / (ends - starts)
+        return values
+    counts = np.minimum(np.arange(1, len(values) + 1), window)
+    return np.convolve(values, np.ones(window))[: len(values)] / counts
 
 
 @matplotlib.rc_context(STYLE)
