@@ -84,7 +84,7 @@ def make_parts(config: DictConfig) -> Parts:
     actor = make_actor(config, env)
     loss_module = make_loss(config, actor, env)
     updater = make_updater(config, loss_module)
-    return Parts(env, actor, loss_module, updater, make_optimizer(config.optim.lr, loss_module))
+    return Parts(env, actor, loss_module, updater, make_optimizer(config.optim, loss_module))
 
 
 def make_data(config: DictConfig, parts: Parts) -> tuple[ReplayBuffer, Iterator[TensorDictBase]]:

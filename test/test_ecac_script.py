@@ -38,7 +38,7 @@ TINY = (
     "replay_buffer.batch_size=32",
     "loss.num_actor_states=16",
 )
-LOSSES = ("ecac", "pmd_ac", "mpo", "sac", "sac_score", "tqc", "td3", "ddpg")
+LOSSES = ("ecac", "pmd_ac", "mpo", "sac", "sac_score", "tqc", "crossq", "td3", "ddpg")
 
 
 def start(directory, *overrides):
@@ -111,6 +111,16 @@ def test_a_sweep_leaves_a_directory_for_each_run(sweep, loss):
 @pytest.mark.parametrize("loss", [loss for loss in LOSSES if loss not in SWEPT])
 def test_every_other_loss_trains_on_pendulum(tmp_path, train, loss):
     check_run(train(tmp_path, f"loss={loss}", "seed=3"))
+
+
+def test_batch_renormalisation_is_by_the_running_moments(beside_ecac):
+    """After the warm-up, where no bound is reached, however long ago: Ioffe 2017, Eq. 1."""
+    layer = beside_ecac("crossq").Renorm(2, warmup_steps=1)
+    for _ in range(4):
+        layer(torch.randn(50, 2))
+    mean, scale = layer.running_mean.clone(), (layer.running_var + layer.eps).sqrt()
+    batch = torch.randn(50, 2)
+    torch.testing.assert_close(layer(batch), (batch - mean) / scale)
 
 
 def check_run(metrics):
@@ -212,7 +222,7 @@ def test_without_entropy_is_one_option(utils, build):
     config, _, loss_module = build("loss.tau_prime=0")
     _, _, same = build("loss.tau_prime=0", "loss.target_entropy=null")
     assert "log_tau_prime" not in dict(loss_module.named_parameters())
-    utils.make_optimizer(config.optim.lr, loss_module)  # whose rate is there for nothing
+    utils.make_optimizer(config.optim, loss_module)  # whose rate is there for nothing
     batch = random_transitions()
     losses = []
     for each in (loss_module, same):
@@ -282,6 +292,7 @@ def test_a_game_of_minatar_and_fewer_updates_than_frames(tmp_path, train):
         (["env=gym", "env.name=CartPole-v1"], "loss=ecac does not go with env.name=CartPole-v1.*"),
         (["env=pendulum", "loss=discrete_ecac"], "loss=discrete_ecac does not go with"),
         (["env=dm_control", "env.task=fly"], "env.name=cheetah env.task=fly cannot be made"),
+        (["loss=crossq", "critic=layer_norm"], "critic=layer_norm does not go with loss=crossq"),
         (["~optim.lr.log_tau"], "optim.lr must have a learning rate for each of"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
@@ -291,7 +302,7 @@ def test_bad_options_end_with_a_clear_message(utils, overrides, message):
     with pytest.raises(ValueError, match=message):  # noqa: PT012 - the script's first steps
         env = utils.make_environment(config, seed=0)
         loss_module = utils.make_loss(config, utils.make_actor(config, env), env)
-        utils.make_optimizer(config.optim.lr, loss_module)
+        utils.make_optimizer(config.optim, loss_module)
 
 
 @pytest.mark.parametrize(
@@ -464,7 +475,7 @@ def test_a_compiled_update_that_leaves_the_policy_leaves_it(utils, build):
 
     def weights(*, is_compiled):
         config, actor, loss_module = build("loss=td3")
-        optimizer = utils.make_optimizer(config.optim.lr, loss_module)
+        optimizer = utils.make_optimizer(config.optim, loss_module)
         policies = []
         for count in range(1, 5):
             losses, is_due = loss_module(random_transitions()), count % 2 == 0
@@ -485,7 +496,7 @@ def test_adam_has_a_group_for_each_learning_rate(utils, build):
     config, _, loss_module = build()
     rates = {
         parameter: group["lr"]
-        for group in utils.make_optimizer(config.optim.lr, loss_module).param_groups
+        for group in utils.make_optimizer(config.optim, loss_module).param_groups
         for parameter in group["params"]
     }
     for name, parameter in loss_module.named_parameters():

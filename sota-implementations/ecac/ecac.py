@@ -85,7 +85,7 @@ def main(config: DictConfig) -> None:
     loss_module = make_loss(config, actor, evaluation_env)
     temperatures = make_temperatures(config.loss, loss_module)
     updater = make_updater(config, loss_module)
-    optimizer = make_optimizer(config.optim.lr, loss_module)
+    optimizer = make_optimizer(config.optim, loss_module)
     replay_buffer = make_replay_buffer(config)
     collector = make_collector(config, make_policy(config.loss, actor, evaluation_env))
     if config.compile:
@@ -134,12 +134,12 @@ def main(config: DictConfig) -> None:
                 for _ in range(updates_due(progress.frames, new, config.updates_per_frame)):
                     is_policy_due = (progress.updates + 1) % config.loss.policy_delay == 0
                     batch = replay_buffer.sample()
-                    # What is compiled is the whole.
-                    losses = compute_losses(loss_module, batch, is_policy_due or config.compile)
-                    loss = total(losses, is_policy_due)
+                    new_losses = compute_losses(loss_module, batch, is_policy_due)
+                    loss = total(new_losses, is_policy_due)
                     if not loss.isfinite():
-                        run.check(scalars(losses), progress.frames)
+                        run.check(scalars(new_losses), progress.frames)
                     descend(loss, optimizer, kept=None if is_policy_due else actor)
+                    losses.update(new_losses.detach())  # the policy's stay from when it was due
                     progress.updates += 1
                     if is_policy_due:
                         updater.step()

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from crossq import NothingDelayed, make_renormalised_critic
 from omegaconf import DictConfig, OmegaConf
 from score_sac import ScoreSACLoss
 from tensordict import TensorDict, TensorDictBase
@@ -31,6 +32,7 @@ from torchrl.envs import (
 )
 from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import (
+    CrossQLoss,
     DDPGLoss,
     DiscreteSACLoss,
     LossModule,
@@ -77,6 +79,7 @@ LOSSES = {
     "sac": WidthSACLoss,
     "sac_score": ScoreSACLoss,
     "tqc": TQCLoss,
+    "crossq": CrossQLoss,
     "td3": TD3Loss,
     "ddpg": DDPGLoss,
 }
@@ -167,8 +170,17 @@ def make_loss(config: DictConfig, actor: TensorDictModuleBase, env: EnvBase) -> 
     """The loss that ``loss=`` names, with its critics."""
     action_spec: Any = env.action_spec_unbatched
     sizes = {"hidden_sizes": config.hidden_sizes, "layer_norm": config.critic == "layer_norm"}
+    critics: list[TensorDictModuleBase]
     if isinstance(action_spec, Categorical):
         critics = [make_action_value_network(_observation_size(env), action_spec.n, **sizes)]
+    elif config.loss.name == "crossq":
+        if config.critic != "plain":
+            raise ValueError(
+                f"critic={config.critic} does not go with loss=crossq, whose critics normalise by "
+                "batches: leave it out."
+            )
+        dimensions = _observation_size(env), action_spec.shape[-1]
+        critics = [make_renormalised_critic(*dimensions, config.hidden_sizes)]
     else:
         outputs = {"num_outputs": config.loss.get("num_quantiles", 1)}
         actions = action_spec.shape[-1]
@@ -189,7 +201,7 @@ def make_loss(config: DictConfig, actor: TensorDictModuleBase, env: EnvBase) -> 
         options["noise_clip"] *= _half_range(action_spec)
     if config.loss.name == "discrete_sac":
         options["num_actions"] = action_spec.n
-    if config.loss.name in ("sac", "discrete_sac", "sac_score", "td3", "tqc"):
+    if config.loss.name in ("sac", "discrete_sac", "sac_score", "td3", "tqc", "crossq"):
         options["deactivate_vmap"] = True  # the faster way on a CPU; the numbers are the same
     loss_module = LOSSES[config.loss.name](actor, *critics, **options)
     loss_module.make_value_estimator(gamma=config.gamma)
@@ -199,9 +211,11 @@ def make_loss(config: DictConfig, actor: TensorDictModuleBase, env: EnvBase) -> 
 def compute_losses(
     loss_module: LossModule, batch: TensorDictBase, with_policy: bool
 ) -> TensorDictBase:
-    """The losses of a batch; TD3's, in an update that leaves the policy, without the policy's."""
+    """The losses of a batch; without the policy's where an update leaves the policy."""
     if isinstance(loss_module, TD3Loss) and not with_policy:
         return TensorDict(loss_qvalue=loss_module.value_loss(batch)[0])
+    if isinstance(loss_module, CrossQLoss) and not with_policy:
+        return TensorDict(loss_qvalue=loss_module.qvalue_loss(batch)[0])
     return loss_module(batch)
 
 
@@ -222,13 +236,15 @@ def make_temperatures(config: DictConfig, loss_module: LossModule) -> Temperatur
     return TemperatureScheduler(loss_module, **schedules)
 
 
-def make_updater(config: DictConfig, loss_module: LossModule) -> TargetNetUpdater:
+def make_updater(config: DictConfig, loss_module: LossModule) -> TargetNetUpdater | NothingDelayed:
     """Polyak averages; the reference policy of our losses is a copy instead."""
     delayed = [
         name.removeprefix("target_").removesuffix("_params")
         for name, _ in loss_module.named_children()
         if name.startswith("target_")
     ]
+    if not delayed:
+        return NothingDelayed()
     updaters: list[TargetNetUpdater] = []
     if config.loss.get("reference_interval", 1) > 1:
         delayed.remove("actor_network")
@@ -237,8 +253,9 @@ def make_updater(config: DictConfig, loss_module: LossModule) -> TargetNetUpdate
     return UpdaterSequence(PolyakAverage(loss_module, *delayed, weight=config.polyak), *updaters)
 
 
-def make_optimizer(learning_rates: DictConfig, loss_module: LossModule) -> torch.optim.Optimizer:
+def make_optimizer(config: DictConfig, loss_module: LossModule) -> torch.optim.Optimizer:
     """Adam, with a learning rate for each network and learned temperature that there is."""
+    learning_rates = config.lr
     networks: dict[str, list[Tensor]] = {}
     for name, parameter in loss_module.named_parameters():
         owner = name.split(".")[0].removesuffix("_params")
@@ -252,7 +269,9 @@ def make_optimizer(learning_rates: DictConfig, loss_module: LossModule) -> torch
     for owner, parameters in networks.items():
         groups.setdefault(learning_rates[owner], []).extend(parameters)
     return torch.optim.Adam(
-        [{"params": parameters, "lr": rate} for rate, parameters in groups.items()], fused=True
+        [{"params": parameters, "lr": rate} for rate, parameters in groups.items()],
+        betas=tuple(config.get("betas", (0.9, 0.999))),
+        fused=True,
     )
 
 
