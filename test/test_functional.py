@@ -944,6 +944,42 @@ def test_clipped_gain_by_hand(dtype, ratio, advantage, gain, slope):
     assert is_cut.item() is (slope == 0 and advantage != 0)
 
 
+def test_nothing_is_cut_off_where_nothing_is_gained():
+    log_ratio = torch.tensor([-1.0, 0.0, 1.0])
+    _, is_cut = clipped_gain(log_ratio, torch.zeros(3), clip_low=0.2, clip_high=0.2)
+    assert not is_cut.any()
+
+
+@pytest.mark.parametrize("function", [soft_value, soft_value_estimate, surrogate_reward])
+def test_a_temperature_for_each_group(function):
+    """[G, 1] beside [G, K], and [1, G] beside [K, G]; no other shape but a single number."""
+    score, log_prob = torch.randn(3, 4), torch.randn(3, 4) - 2
+    tau, tau_prime = torch.tensor([[0.1], [0.5], [1.0]]), torch.tensor([[0.3], [0.2], [0.1]])
+    expected = torch.stack(
+        [
+            function(score[i], log_prob[i], tau=tau[i].item(), tau_prime=tau_prime[i].item())
+            for i in range(3)
+        ]
+    )
+    assert_close(function(score, log_prob, tau=tau, tau_prime=tau_prime), expected)
+    for temperatures in ({"tau": tau.T, "tau_prime": tau_prime.T}, {"tau": tau[:, 0]}):
+        options = {"tau_prime": tau_prime[:, 0], **temperatures, "sample_dim": 0}
+        assert_close(function(score.T, log_prob.T, **options), expected)
+    square = score[:, :3]
+    with pytest.raises(ValueError, match=r"tau must have 1 along the axis of the samples, -1 of"):
+        function(square, square, tau=tau[:, 0], tau_prime=0.1)
+
+
+@pytest.mark.parametrize(("shape", "sample_dim"), [((3, 1), -1), ((1,), 1), ((4,), 0), ((), 1)])
+def test_samples_are_not_repeated(shape, sample_dim):
+    """Weights over one sample would be 1, and the loss K times too large."""
+    message = rf"log_weights must have [34] along the axis of the samples, {sample_dim} of \(3, 4\)"
+    with pytest.raises(ValueError, match=message):
+        mean_seeking_projection(torch.zeros(3, 4), torch.zeros(shape), sample_dim=sample_dim)
+    alike = mean_seeking_projection(torch.zeros(3, 4), torch.arange(4.0))
+    assert alike.loss.shape == (3,)
+
+
 @DTYPES
 def test_divergence_penalty_by_hand(dtype):
     """Of d = 0, log 2, log 1/2; its slope is 1 - e^d."""

@@ -103,8 +103,10 @@ def test_schedules_that_end_where_the_loss_is_not_defined(schedules, message):
     """Refused at once, not when they have come there; a function may end anywhere."""
     loss = ECPOLoss(make_softmax_policy(torch.eye(3)), tau_prime=0.0)
     lines = {name: linear(*ends, 10) for name, ends in schedules.items()}
+    before = loss.tau.item(), loss.tau_prime.item()
     with pytest.raises(ValueError, match=message):
         TemperatureScheduler(loss, **lines)
+    assert (loss.tau, loss.tau_prime) == before
     TemperatureScheduler(loss, tau=linear(0.5, 0.0, 10), tau_prime=lambda count: 0.1)
     with pytest.raises(TypeError, match=r"schedule of tau must be a function.*constant\(0.5\)"):
         TemperatureScheduler(loss, tau=0.5)

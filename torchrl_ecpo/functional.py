@@ -33,13 +33,14 @@ keepdim                               whether the sample axis stays, with length
 ==================== ================ =====================================================
 
 Where an argument is what the table says, its function does not say it again. Temperatures are
-numbers or tensors (0-d, or one for each group), in the unit of the score. Numbers, types and shapes
-are checked (TypeError, ValueError), and shapes broadcast to one of theirs; the values of tensors
-are taken as they are, so that nothing waits for a device: NaN comes out as NaN. Finite input never
-gives NaN, as long as the temperatures are neither 0 nor infinite in the dtype of the scores (from
-1e-37 to 1e38 in float32). Half precision is too narrow for sums over trajectories: give float32, as
-the losses do. A group in which all samples are masked has weights and a loss of 0, and no soft
-value.
+numbers or tensors (0-d, or ``[E*, 1]``, one for each group), in the unit of the score. Numbers,
+types and shapes are checked (TypeError, ValueError), and shapes broadcast to one of theirs, but not
+along the samples; the values of tensors are taken as they are, so that nothing waits for a device:
+NaN comes out as NaN. Finite input never gives NaN, as long as the temperatures are neither 0 nor
+infinite in the dtype of the scores (from 1e-37 to 1e38 in float32), but for values of 1e20 and
+above in :func:`matched_temperature` and :func:`path_consistency`. Half precision is too narrow for
+sums over trajectories: give float32, as the losses do. A group in which all samples are masked has
+weights and a loss of 0, and no soft value.
 """
 
 from __future__ import annotations
@@ -89,6 +90,7 @@ __all__ = [
 ]
 
 
+TEMPERATURES = ("tau", "tau_prime")
 LEAST_VARIANCE = 0.01
 """Of an estimate, in units of the reference's variance."""
 
@@ -130,7 +132,7 @@ def _check_samples(
     for name, value in values.items():
         if isinstance(value, Tensor) and (value.is_floating_point() or _is_score(name, value)):
             tensors[name] = value
-        elif value is not None and not (name in ("tau", "tau_prime") and _is_number(value)):
+        elif value is not None and not (name in TEMPERATURES and _is_number(value)):
             raise TypeError(f"{name} must be a floating-point tensor, got {_kind(value)}.")
     if mask is not None:
         if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
@@ -146,7 +148,29 @@ def _check_samples(
             f"sample_dim must be an axis of {', '.join(tensors)}, which have the shape "
             f"{tuple(shape)}, got {sample_dim!r}."
         )
+    if sample_dim is not None:
+        axis = _axis(sample_dim, shape)
+        for name, value in tensors.items():
+            size = value.shape[axis] if value.ndim >= -axis else None
+            wanted = (1, None) if name in TEMPERATURES else (shape[axis],)
+            if size not in wanted and name != "mask":
+                raise ValueError(
+                    f"{name} must have {wanted[0]} along the axis of the samples, {sample_dim} of "
+                    f"{tuple(shape)}, got the shape {tuple(value.shape)}."
+                )
     return shape
+
+
+def _axis(sample_dim: int, shape: torch.Size) -> int:
+    """The axis of the samples, counted from the last."""
+    return sample_dim % len(shape) - len(shape)
+
+
+def _of_groups(temperature: float | Tensor, axis: int) -> float | Tensor:
+    """A temperature without the axis of the samples, if it has one."""
+    if isinstance(temperature, Tensor) and temperature.ndim >= -axis:
+        return temperature.squeeze(axis)
+    return temperature
 
 
 def _whole(shapes: Sequence[torch.Size]) -> torch.Size | None:
@@ -893,7 +917,8 @@ def clipped_gain(
         log_ratio.clamp(max=too_high),
         log_ratio.clamp(min=too_low, max=_largest_exponent(log_ratio)),
     )
-    return _representable(limited.exp() * advantage), limited != log_ratio
+    is_cut = (limited != log_ratio) & (advantage != 0)
+    return _representable(limited.exp() * advantage), is_cut
 
 
 def divergence_penalty(log_prob: Tensor, reference_log_prob: Tensor) -> Tensor:
@@ -1010,10 +1035,11 @@ def soft_value(
     """
     check_temperatures(tau=tau, tau_prime=tau_prime)
     values = {"score": score, "reference_log_prob": reference_log_prob}
-    _check_samples(sample_dim, mask, **values, tau=tau, tau_prime=tau_prime)
+    shape = _check_samples(sample_dim, mask, **values, tau=tau, tau_prime=tau_prime)
     temperature = tau + tau_prime
     logits = _representable((score + tau * reference_log_prob) / temperature)
-    return temperature * _masked_logsumexp(logits, sample_dim, mask)
+    log_sum = _masked_logsumexp(logits, sample_dim, mask)
+    return _of_groups(temperature, _axis(sample_dim, shape)) * log_sum
 
 
 def soft_value_estimate(
@@ -1041,9 +1067,11 @@ def soft_value_estimate(
         >>> soft_value_estimate(torch.ones(1), torch.tensor([-2.0]), tau=0.5, tau_prime=0.25)
         tensor(1.5000)
     """
-    _check_samples(sample_dim, mask, score=score, reference_log_prob=reference_log_prob)
+    values = {"score": score, "reference_log_prob": reference_log_prob}
+    shape = _check_samples(sample_dim, mask, **values, tau=tau, tau_prime=tau_prime)
     log_weights = lifted_log_weights(score, reference_log_prob, tau=tau, tau_prime=tau_prime)
-    return (tau + tau_prime) * log_mean_exp(log_weights, sample_dim=sample_dim, mask=mask)
+    log_mean = log_mean_exp(log_weights, sample_dim=sample_dim, mask=mask)
+    return _of_groups(tau + tau_prime, _axis(sample_dim, shape)) * log_mean
 
 
 def surrogate_reward(
@@ -1256,7 +1284,7 @@ def matched_temperature(
     """
     check_temperatures(tau_prime=tau_prime, allow_zero=True)
     given = {"score": score, "reference_log_prob": reference_log_prob, "tau_prime": tau_prime}
-    num_groups = _check_samples(mask=mask, **given)[:-1].numel()
+    num_groups = _check_samples(-1, mask, **given)[:-1].numel()
     of_score, of_log_prob = (_pooled_variance(x, mask) for x in (score, reference_log_prob))
     return tau_prime * ((of_score + 1 / num_groups) / of_log_prob.clamp_min(1)).sqrt()
 

@@ -164,13 +164,13 @@ class TemperatureScheduler:
         self.loss_module = loss_module
         self.schedules = schedules
         self.count = 0.0
-        self._write()
         if isinstance(loss_module, PolicyLoss):
             ends = {name: getattr(s, "keywords", {}).get("end") for name, s in schedules.items()}
             try:
                 loss_module.allowed_temperatures(**ends)
             except ValueError as error:
                 raise ValueError(f"Where the schedules end: {error}") from None
+        self._write()
 
     def step(self, count: float = 1) -> None:
         """Advance by ``count``, at least 0, and write the temperatures."""

@@ -58,3 +58,11 @@ def test_reset_parameters_gives_the_uniform_policy():
     torch.nn.init.ones_(module.theta)
     module.reset_parameters()
     assert not module(torch.ones(1)).any()
+
+
+def test_features_are_the_policys_own():
+    """A state dict is loaded into them, not into the environment's."""
+    features = torch.eye(3)
+    policy = make_softmax_policy(features)
+    policy.load_state_dict(make_softmax_policy(2 * torch.eye(3)).state_dict())
+    assert torch.equal(features, torch.eye(3))

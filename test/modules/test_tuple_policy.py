@@ -561,5 +561,7 @@ def test_core_refuses_shapes() -> None:
         lstm(data)
     with set_recurrent_mode(True), pytest.raises(ValueError, match="time last, in recurrent mode"):
         make_tuple_policy(NUM_OBSERVATIONS, NVEC, hidden_size=8).module[0](data[0])
+    with pytest.raises(ValueError, match="tables=True needs a window"):
+        make_tuple_policy(NUM_OBSERVATIONS, NVEC, tables=True)
     with pytest.raises(ValueError, match=r"product of at most 2\^31, got \(65536, 65536\)"):
         DistinctHistoryLSTM([2**16, 2**16], 8, in_keys=["observation"])

@@ -411,6 +411,7 @@ def expected_outputs(
             "kl_target_reference": (weights * (weights.log() - lifted.reference)).sum(0),
             "kl_reference_policy": (probability * (lifted.reference - log_prob)).sum(0),
             "entropy": -(probability * lifted.reference).sum(0),
+            "qvalue": (probability * lifted.score).sum(0),
         }
     else:
         log_prob = gaussian_log_prob(new.actor, state, lifted.latent).detach()
@@ -418,13 +419,13 @@ def expected_outputs(
             "kl_target_reference": (weights * (weights * len(weights)).log()).sum(0),
             "kl_reference_policy": (lifted.reference - log_prob).mean(0),
             "entropy": -lifted.reference.mean(0),
+            "qvalue": lifted.score.mean(0),
             "saturation": (lifted.latent.tanh().abs() > 0.95)
             .to(batch["observation"].dtype)
             .mean((0, -1)),
         }
     return outputs | {
         "ESS": 1 / (weights**2).sum(0),
-        "qvalue": lifted.score.mean(0),
         "state_value": lifted.value,
         "tau": torch.full_like(lifted.value, case.tau),
         "tau_prime": torch.full_like(lifted.value, case.tau_prime),

@@ -471,7 +471,7 @@ def test_discrete_lift_and_losses_by_hand():
     assert_close(outputs["entropy"].item(), log(4) - 0.75 * log(3))
     divergence = target[0] * (4 * target[0]).log() + target[1] * (4 / 3 * target[1]).log()
     assert_close(outputs["kl_target_reference"], divergence)
-    assert_close(outputs["qvalue"].item(), log(2) + log(3))
+    assert_close(outputs["qvalue"].item(), 0.25 * 2 * log(2) + 0.75 * 2 * log(3))
     # V(second state) = 2 log((1 + 3) / sqrt(2)), at gamma = 1/2; Q of the action is 2 log 3 (+ 1)
     bellman = 10 + 0.5 * 2 * log(4 / math.sqrt(2))
     errors = [2 * log(3) - bellman, 2 * log(3) + 1 - bellman]

@@ -422,6 +422,22 @@ def test_reps_finds_the_temperature_of_its_bound(epsilon, tau_prime, padded):
     assert_close(out.select(*names), ecpo(batch).select(*names))
 
 
+@pytest.mark.parametrize("name", CASES)
+def test_a_subclass_may_learn_a_temperature(name):
+    """Where it stands at the scheduled value, the losses are those of the member."""
+    case = CASES[name]
+    temperature = next(iter(case.temperatures))
+
+    class Learning(case.loss):
+        def __init__(self, *networks, **options):
+            super().__init__(*networks, **options)
+            self.learn(temperature, case.temperatures[temperature])
+
+    loss, actor, batch = problem(case)
+    learning = Learning(actor, **case.temperatures, **case.options).double()
+    assert_close(learning(batch), loss(batch), rtol=1e-6, atol=1e-6)
+
+
 def test_reps_measures_from_the_reference():
     """Also where another policy drew the trajectories."""
     actor, reference = make_actor(), make_actor()

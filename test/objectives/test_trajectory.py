@@ -478,8 +478,11 @@ def test_batches_of_any_kind():
         shallow = batch.clone().auto_batch_size_(batch_dims=dims)
         assert_close(loss(shallow), expected)
         assert shallow.batch_dims == dims
+    whole = {MASK: torch.ones(2, 3, 4, dtype=torch.bool)}
     for dim in (0, 1):
         assert_close(loss(lazy_stack(list(batch.unbind(dim)), dim)), expected)
+        masked = list(batch.clone().update(whole).unbind(dim))
+        assert_close(loss(lazy_stack(masked, dim)), expected)
     for lock in ("lock_", "memmap_", "share_memory_"):
         assert_close(loss(getattr(batch.clone(), lock)()), expected)
 
@@ -674,11 +677,18 @@ def test_one_step_problems_without_a_time_axis(masked):
     batch = batch[..., 0].clone()
     batch["next", "done"] = torch.ones(2, 3, 1, dtype=torch.bool)
     if masked:
-        batch[MASK] = torch.tensor([[True, True, True], [True, True, False]])
+        batch[MASK] = torch.tensor([[True, True, True], [True, False, True]])
     loss.reduction = "none"
     out = loss(batch)
     assert out.shape == (2,)
     assert_close(out, loss(batch.unsqueeze(-1)))
+
+
+def test_one_group_of_one_step_problems():
+    loss, _, batch = problem(ECPO, padded=False)
+    batch = batch[:1, :, 0].clone()
+    batch["next", "done"] = torch.ones(1, 3, 1, dtype=torch.bool)
+    assert_close(loss(batch), loss(batch.unsqueeze(-1)))
 
 
 def test_no_value_estimator():

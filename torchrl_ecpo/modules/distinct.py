@@ -172,7 +172,8 @@ class DistinctCore(TensorDictModuleBase):
     def _starts(self, tensordict: TensorDictBase) -> Tensor:
         """Where sequences have no past, bool `[*B]`."""
         if not self.state_keys:
-            return torch.ones(tensordict.shape, dtype=torch.bool, device=tensordict.device)
+            device = tensordict.get(self.input_keys[0]).device
+            return torch.ones(tensordict.shape, dtype=torch.bool, device=device)
         is_init = tensordict.get("is_init", None)
         if is_init is None:
             raise KeyError(

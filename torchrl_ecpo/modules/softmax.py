@@ -40,7 +40,7 @@ class LinearSoftmax(nn.Module):
                 "features must be finite floating-point numbers [num_actions, num_features], got "
                 f"{described(features)}."
             )
-        self.register_buffer("features", features)
+        self.register_buffer("features", features.clone())  # a state dict is loaded into it
         self.theta = nn.Parameter(features.new_zeros(features.shape[-1]))
 
     def forward(self, observation: Tensor) -> Tensor:

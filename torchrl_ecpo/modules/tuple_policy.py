@@ -384,12 +384,14 @@ def make_tuple_policy(
     inputs: list[NestedKey] = ["observation", "previous_action"]
     keys: dict[str, Any] = {"in_keys": inputs, "out_key": "logits"}
     core: Any
+    if check_flag("tables", tables) and window is None:
+        raise ValueError("tables=True needs a window, whose steps they are of; got window=None.")
     readout = nn.Linear(hidden_size, _num_logits(nvec))
     if window is None:
         core = DistinctHistoryLSTM(num_classes, hidden_size, readout, **keys)
     else:
         network: nn.Module
-        if check_flag("tables", tables):
+        if tables:
             network = TupleTables(num_classes, window, hidden_size)
         else:
             sizes = num_classes * check_count("window", window)

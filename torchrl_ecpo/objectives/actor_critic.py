@@ -538,7 +538,10 @@ class ActorCriticLoss(PolicyLoss):
         # Distributions refuse NaN, also where nothing comes of it.
         blank = _blank if self.skip_done_states else _blank_unless_finite
         observations: Any = tensordict.select(*self._next_observations)
-        observations = observations.apply(lambda x: blank(x, ended))
+        # With a batch size also a lazy stack is taken as a whole, as `ended` is.
+        observations = observations.apply(
+            lambda x: blank(x, ended), batch_size=observations.batch_size
+        )
         if self.value_network is not None:
             return self._state_value(observations, self.target_value_network_params)
         params = self.target_actor_network_params if self.delay_actor else self.actor_network_params
@@ -704,7 +707,7 @@ class ActorCriticLoss(PolicyLoss):
             "kl_target_reference": actions.divergence_of(lift.weights, lift.log_weights),
             "kl_reference_policy": moved,
             "entropy": actions.mean(-actions.log_prob),
-            "qvalue": lift.score.mean(0),
+            "qvalue": actions.mean(lift.score),
             "state_value": lift.value,
             **surrogate.metrics,
         }

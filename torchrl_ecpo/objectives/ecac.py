@@ -305,7 +305,6 @@ class DiscreteECACLoss(ECACLoss):
         target_kl: float | None = 0.1,
         target_entropy: float | Literal["auto"] | None = None,
         target_entropy_weight: float = 0.98,
-        projection: Literal["paper"] = "paper",
         **options: Any,
     ) -> None:
         super().__init__(
@@ -315,7 +314,7 @@ class DiscreteECACLoss(ECACLoss):
             tau_prime=tau_prime,
             target_kl=target_kl,
             target_entropy=target_entropy,
-            projection=projection,
+            projection="paper",
             **options,
         )
         self.target_entropy_weight = as_share("target_entropy_weight", target_entropy_weight)

@@ -112,7 +112,7 @@ class GRPOLoss(TrajectoryGroupLoss):
             log_ratio, advantage, clip_low=self.clip_low, clip_high=self.clip_high
         )
         penalty = divergence_penalty(steps.log_prob, steps.reference_log_prob)
-        loss = masked_mean(self.kl_to_ref_coeff * penalty - gain, mask=steps.mask)
+        loss = masked_mean(self.temperature("kl_to_ref_coeff") * penalty - gain, mask=steps.mask)
         if self.aggregation != "prompt_mean":
             loss = loss * groups.num_steps
         if self.aggregation == "token_mean":

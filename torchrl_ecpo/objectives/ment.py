@@ -68,4 +68,6 @@ class MENTLoss(TrajectoryGroupLoss):
 
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
         """REINFORCE on the score less tau log pi."""
-        return ment_surrogate(groups.log_prob, groups.scores, tau=self.tau, mask=groups.mask)
+        return ment_surrogate(
+            groups.log_prob, groups.scores, tau=self.temperature("tau"), mask=groups.mask
+        )

@@ -35,8 +35,9 @@ class PMDACLoss(ActorCriticLoss):
     ``projection`` and ``width_entropy``, and with these differences:
 
     Keyword Args:
-        tau: temperature of the divergence from the reference, in the unit of Q. It has an effect
-            with ``delay_actor=True`` only: a policy does not differ from itself. Default: 0.1.
+        tau: temperature of the divergence from the reference, in the unit of Q. The policy's
+            loss depends on it with ``delay_actor=True`` only: a policy does not differ from itself.
+            Default: 0.1.
         target_kl: needs several ``num_action_samples``. Default: None, a fixed tau.
         num_action_samples: actions of the reference by which lift, metrics and the value network's
             target are estimated; the projection does not need them. Default: 1.

@@ -63,6 +63,8 @@ class RLOOLoss(MENTLoss):
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
         """REINFORCE on the score less tau log pi, against the others."""
         mask, log_prob = groups.mask, groups.log_prob
-        advantage = leave_one_out(groups.scores - self.tau * log_prob.detach(), mask=mask)
+        advantage = leave_one_out(
+            groups.scores - self.temperature("tau") * log_prob.detach(), mask=mask
+        )
         loss = score_function_loss(log_prob, advantage, mask=mask)
         return Surrogate(loss, uniform_weights(log_prob, mask=mask))

@@ -86,4 +86,4 @@ class SquaredPMDLoss(LiftProjectLoss):
             behaviour_log_prob=groups.behaviour_log_prob,
             mask=groups.mask,
         )
-        return projection._replace(loss=(self.tau + self.tau_prime) * projection.loss)
+        return projection._replace(loss=sum(self.temperatures()) * projection.loss)

@@ -81,4 +81,6 @@ class TPOLoss(TrajectoryGroupLoss):
         if self.length_norm:
             length = groups.num_steps.clamp_min(1)
             log_prob, reference = log_prob / length, reference / length
-        return group_cross_entropy(log_prob, groups.scores / self.tau + reference, mask=groups.mask)
+        return group_cross_entropy(
+            log_prob, groups.scores / self.temperature("tau") + reference, mask=groups.mask
+        )

@@ -409,15 +409,15 @@ class TrajectoryGroupLoss(PolicyLoss):
         shape = _batch_shape(reward, self._reward_key)
         mask = self._mask(tensordict, shape)
         if values_can_be_seen():
-            real_steps = torch.ones(shape, dtype=torch.bool, device=reward.device)
-            if mask is not None:
-                check_padding(self.mask_keys, mask)
-                self._check_left(self.mask_keys, mask)
-                real_steps = mask
-            if self._lacks_time(tensordict, real_steps):
+            every = torch.ones(shape, dtype=torch.bool, device=reward.device)
+            if self._lacks_time(tensordict, every if mask is None else mask):
                 steps = tensordict.copy()
                 steps.batch_size = shape
                 return self._read_steps(steps.unsqueeze(-1))
+            if mask is not None:
+                check_padding(self.mask_keys, mask)
+                self._check_left(self.mask_keys, mask)
+        check_group_size(shape[-2], f"K of the batch [*G, K, T] = {tuple(shape)}")
 
         def real(values: Tensor) -> Tensor:
             # A sum over a completion of 1,000 tokens would be off by nats in half precision, and
@@ -476,7 +476,10 @@ class TrajectoryGroupLoss(PolicyLoss):
         if step_mask is not None:
             step_mask = step_mask.reshape(-1, shape[-1])
             last = _last_real_step(step_mask)
-            inputs = inputs.apply(lambda entry: take_rows(entry.flatten(0, 1), last))
+            # With a batch size also a lazy stack is taken as a whole, as `last` is.
+            inputs = inputs.apply(
+                lambda entry: take_rows(entry.flatten(0, 1), last), batch_size=inputs.batch_size
+            )
             inputs.set(self.mask_keys[0], step_mask)
         return inputs
 
@@ -736,7 +739,6 @@ def _batch_shape(reward: Tensor, key: NestedKey) -> torch.Size:
             f"The batch is empty: the reward {key!r} has the shape {tuple(reward.shape)}."
         )
     check_real(key, reward)
-    check_group_size(reward.shape[-3], f"K of the batch [*G, K, T] = {tuple(reward.shape[:-1])}")
     return reward.shape[:-1]
 
 

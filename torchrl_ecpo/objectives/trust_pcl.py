@@ -157,7 +157,7 @@ class TrustPCLLoss(LiftProjectLoss):
             log_prob,
             steps.reference_log_prob,
             values,
-            tau=self.tau,
+            tau=self.temperature("tau"),
             tau_prime=self.tau_prime,
             gamma=self.gamma,
             n_steps=self.n_steps,

@@ -60,4 +60,6 @@ class UREXLoss(TrajectoryGroupLoss):
 
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
         """The gradient of the UREX objective."""
-        return urex_surrogate(groups.log_prob, groups.scores, tau=self.tau, mask=groups.mask)
+        return urex_surrogate(
+            groups.log_prob, groups.scores, tau=self.temperature("tau"), mask=groups.mask
+        )
