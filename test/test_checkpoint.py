@@ -54,7 +54,10 @@ RUNS = {
         *(*CONTROL, "env=hopper", ECAC_STATES),
         *("loss.reference_interval=5", "replay_buffer.size=100"),
     ),
-    "memmap": (*CONTROL, "env=pendulum", "loss=td3", "replay_buffer.storage=memmap"),
+    "memmap": (
+        *(*CONTROL, "env=pendulum", "loss=td3", "replay_buffer.storage=memmap"),
+        *("updates_per_frame=0.1", "log_interval=8"),  # rows between updates
+    ),
 }
 
 

@@ -46,6 +46,7 @@ from torchrl_ecpo.collectors import (
     TrajectoryGroupCollector,
     shut_down,
 )
+from torchrl_ecpo.collectors.workers import Workers
 from torchrl_ecpo.envs import GroupedEnv
 from torchrl_ecpo.envs._groups import GroupIdAllocator
 from torchrl_ecpo.groups import TrajectoryGroupSampler, pack_groups, unpack_groups
@@ -527,6 +528,19 @@ def test_random_actions_are_written_to_a_replay_buffer(make):
     assert len(buffer) >= 90
     # Workers draw from streams of their own.
     assert len(groups["action"][:, 0, 0].unique()) == len(groups)
+
+
+class Player:
+    """Has played at once."""
+
+    def play(self):
+        return "a batch"
+
+
+def test_no_worker_waits_longer_than_the_others():
+    """All have a batch; that of the one that began first is taken."""
+    workers = Workers([Player] * 3, backend="direct", sync=False)
+    assert [workers.play()[0][0] for _ in range(9)] == [0, 1, 2] * 3
 
 
 class Stranger(Countdown):

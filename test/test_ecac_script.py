@@ -25,6 +25,7 @@ from torchrl.envs import GymEnv, GymWrapper
 from torchrl.objectives import SACLoss
 
 from torchrl_ecpo.experiment import read_metrics
+from torchrl_ecpo.experiment._videos import greedy_episodes
 from torchrl_ecpo.modules import DenseNetwork
 
 SCRIPT = Path(__file__).parents[1] / "sota-implementations/ecac"
@@ -396,13 +397,17 @@ def test_a_video_of_the_first_episode_is_saved(utils, tmp_path, monkeypatch):
         def rollout(self, max_steps, policy):
             pixels = torch.randint(256, (4, 8, 6, 3), dtype=torch.uint8)
             rewards = torch.arange(4.0).unsqueeze(-1)
-            return TensorDict({"pixels": pixels, "next": {"episode_reward": rewards}}, [4])
+            following = {"episode_reward": rewards, "pixels": pixels}
+            return TensorDict({"pixels": pixels, "next": following}, [4])
 
     monkeypatch.chdir(tmp_path)
     config = OmegaConf.create({"episodes": 2, "video": True})
     assert utils.evaluate(Env(), None, config, 40) == {"evaluation_return": 3.0}
     with Image.open("evaluation_40.gif") as video:
         assert (video.n_frames, video.size) == (4, (6, 8))
+    kept = [[*episode.keys(True, True)] for episode in greedy_episodes(Env(), None, 2)]
+    reward = ("next", "episode_reward")
+    assert [set(keys) for keys in kept] == [{"pixels", reward}, {reward}]
 
 
 @pytest.mark.parametrize(("name", "ends_early"), [("Pendulum-v1", False), ("Hopper-v5", True)])

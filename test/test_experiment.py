@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 
 from torchrl_ecpo.experiment import MetricsTable, Run, leaving_nothing, read_metrics
 from torchrl_ecpo.experiment import run as run_module
-from torchrl_ecpo.experiment.compare import Comparison, find_runs, load_comparison
+from torchrl_ecpo.experiment.compare import Comparison, final, find_runs, load_comparison
 from torchrl_ecpo.experiment.compare import main as compare
 from torchrl_ecpo.experiment.figures import draw_curve, plot_learning_curve
 
@@ -73,6 +73,29 @@ def test_one_process_makes_a_run(tmp_path, monkeypatch):
         assert [path.name for path in tmp_path.iterdir()] == [".lock"]
     main(make_config())
     assert (tmp_path / "config.yaml").exists()
+
+
+@pytest.mark.parametrize("error", [RuntimeError, ValueError])
+def test_a_run_that_fails_before_its_first_row_leaves_nothing(tmp_path, monkeypatch, error):
+    """Nor what a buffer on the disk has made; from its first row on it keeps all."""
+    (tmp_path / "mine").write_text("")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run_module, "to_absolute_path", lambda path: tmp_path.parent / path)
+
+    @leaving_nothing
+    def main(config):
+        run = make_run(tmp_path, config)
+        (tmp_path / "replay_buffer").mkdir()
+        (tmp_path / "replay_buffer/0.memmap").write_text("")
+        if config.seed:
+            run.log({"return": 1.0}, step=10)
+        raise error("of the simulator")
+
+    for seed, left in ((0, {"mine"}), (1, {"mine", "config.yaml", "metrics.csv", "replay_buffer"})):
+        with pytest.raises(error, match="of the simulator"):
+            main(make_config(seed=seed))
+        assert left <= {path.name for path in tmp_path.iterdir()}
+        assert seed or left == {path.name for path in tmp_path.iterdir()}
 
 
 def test_a_summary_is_of_the_last_run_or_none(tmp_path):
@@ -263,12 +286,30 @@ def test_compare_prints_a_table_and_writes_picture_and_curves(runs, capsys):
         (["nowhere"], "error: There is no run (a folder with metrics.csv) below nowhere.\n"),
         (["--metric", "score"], "has no metric 'score'; it has ["),
         (["--by", "loss.theta"], "has no entry 'loss.theta' to tell methods apart.\n"),
+        (["{bare}"], "There is no config.yaml in {bare}: is it the directory of a run?"),
     ],
 )
 def test_compare_says_in_a_line_what_it_cannot_do(runs, capsys, options, message):
+    bare = runs / "urex/0"
+    options = [option.format(bare=bare) for option in options]
+    if str(bare) in options:
+        (bare / "config.yaml").unlink()
     with pytest.raises(SystemExit):
         compare(options if len(options) == 1 else [str(runs), *options])
-    assert message in capsys.readouterr().err
+    assert message.format(bare=bare) in capsys.readouterr().err
+
+
+def test_compare_takes_a_summary_that_was_cut_off_for_none(runs, capsys):
+    (runs / "urex/0/summary.json").write_text('{"finished": tr')
+    compare([str(runs)])
+    printed = capsys.readouterr().out
+    assert printed.count("not finished") == 1
+    assert str(runs / "urex/0") in printed
+
+
+def test_the_end_of_a_run_that_has_only_begun_is_its_first_row():
+    values = np.array([[2.0], [4.0]])
+    assert final(np.array([0]), values).tolist() == [2, 4]
 
 
 def test_a_curve_of_one_point_is_seen():

@@ -157,9 +157,10 @@ def test_tasks_of_exploration_say_how_many_episodes_are_solved(tmp_path, train, 
 
 
 @pytest.mark.parametrize("policy", ["lstm", "window", "memoryless"])
-def test_a_task_of_popgym_is_played_with_and_without_memory(tmp_path, train, policy):
+def test_a_task_of_popgym_is_played_with_and_without_memory(tmp_path, train, script, policy):
     options = ("env=popgym", f"policy={policy}", "env.max_steps=6", "evaluation.interval=1")
     metrics = train(tmp_path, *options, *TWO_BATCHES)
+    script("play").main([str(tmp_path), "--episodes", "1"])
     assert len(metrics["greedy_return"]) == 2
     assert all(-1 <= value <= 1 for value in metrics["return"] + metrics["greedy_return"])
 
@@ -412,6 +413,13 @@ def test_a_task_whose_package_is_not_there_says_so():
     message = r"env\.name=nowhere:Task-v0 needs what is not installed"
     with pytest.raises(ModuleNotFoundError, match=message):
         open_task("nowhere:Task-v0")
+
+
+def test_episodes_may_be_longer_than_what_is_taken_for_endless(script):
+    options = ["env=gym", "env.max_steps=20000", "num_groups=1", "group_size=2"]
+    config = compose_options(ECPO.parent, options)
+    collector = script("utils").make_collector(config, script("tasks").make_task(config))
+    assert collector._workers.player.max_steps == 20_000
 
 
 def test_a_task_is_opened_no_more_often_than_it_is_played(script, monkeypatch):

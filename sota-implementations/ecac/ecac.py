@@ -18,7 +18,7 @@ if __name__ == "__main__":  # before torch is imported, which takes seconds
 import hydra
 import torch
 from omegaconf import DictConfig
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 from utils import (
     SHOWN,
@@ -93,8 +93,7 @@ def main(config: DictConfig) -> None:
     if config.compile and config.collector.kind == "single":
         compile_module(actor, "policy")
 
-    progress = Progress(frames=0, updates=0, returns=[])
-    losses = TensorDict()
+    progress = Progress(frames=0, updates=0, returns=[], losses={})
     is_log_due, is_evaluation_due = Every(config.log_interval), Every(config.evaluation.interval)
     run = Run(
         config,
@@ -134,12 +133,12 @@ def main(config: DictConfig) -> None:
                 for _ in range(updates_due(progress.frames, new, config.updates_per_frame)):
                     is_policy_due = (progress.updates + 1) % config.loss.policy_delay == 0
                     batch = replay_buffer.sample()
-                    new_losses = compute_losses(loss_module, batch, is_policy_due)
-                    loss = total(new_losses, is_policy_due)
+                    losses = compute_losses(loss_module, batch, is_policy_due)
+                    loss = total(losses, is_policy_due)
                     if not loss.isfinite():
-                        run.check(scalars(new_losses), progress.frames)
+                        run.check(scalars(losses), progress.frames)
                     descend(loss, optimizer, kept=None if is_policy_due else actor)
-                    losses.update(new_losses.detach())  # the policy's stay from when it was due
+                    progress.losses |= scalars(losses)  # the policy's stay from when it was due
                     progress.updates += 1
                     if is_policy_due:
                         updater.step()
@@ -157,7 +156,7 @@ def main(config: DictConfig) -> None:
                 if is_evaluated:
                     metrics |= evaluate(evaluation_env, actor, config.evaluation, progress.frames)
                     speed(progress.frames)  # evaluation does not count
-                run.log({**scalars(losses), **metrics}, step=progress.frames)
+                run.log({**progress.losses, **metrics}, step=progress.frames)
             checkpoints.boundary()
 
 

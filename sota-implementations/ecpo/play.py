@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from stacked.policies import stack_policies
 from tasks import Task, greedy, is_solved, make_single, make_task
 from torchrl.checkpoint import CheckpointError
-from torchrl.envs import TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.modules import get_env_transforms_from_module
 from utils import make_loss
 
@@ -94,7 +93,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print("\n\n".join(episodes(config, task, options.level, options.episodes)))
         elif config.env.kind == "gym":
             directory = options.run.resolve()
-            make = partial(make_single, config)
+
+            def make(**pixels: Any) -> EnvBase:
+                transforms = get_env_transforms_from_module(task.actor)
+                return TransformedEnv(make_single(config, **pixels), transforms, auto_unwrap=False)
+
             show(make, task.actor, options.episodes, directory, config.env.name)
         else:  # one problem instance, in which greedy episodes are all alike
             played: Any = greedy(task.env, task.actor)[0, 0]

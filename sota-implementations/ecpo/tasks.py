@@ -48,6 +48,7 @@ from torchrl_ecpo.envs import (
     make_grouped_env,
 )
 from torchrl_ecpo.experiment._tasks import is_plain, open_task, wrap_task
+from torchrl_ecpo.experiment._videos import LONGEST_EPISODE
 from torchrl_ecpo.modules import (
     PixelEncoder,
     SharedCategorical,
@@ -430,7 +431,9 @@ def make_gym_policy(
 def greedy(env: EnvBase, actor: ProbabilisticTensorDictSequential) -> TensorDictBase:
     """One whole episode in each row, with the most probable actions."""
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        return env.rollout(10_000, actor, break_when_any_done=False, break_when_all_done=True)
+        return env.rollout(
+            LONGEST_EPISODE, actor, break_when_any_done=False, break_when_all_done=True
+        )
 
 
 def passes(groups: TensorDictBase, solved: float) -> Metrics:

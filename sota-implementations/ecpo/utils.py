@@ -41,6 +41,7 @@ LOSSES = {  # whose files in config/loss/ are older than the entry class
     "ment": MENTLoss,
 }
 TEMPERATURES = ("tau", "tau_prime", "kl_to_ref_coeff")
+ENDLESS = 10_000  # steps of a trajectory, unless the task has longer ones
 COMPILABLE = ("bandit", "gym")
 LEAST_ESS = 1.5
 PATIENCE = 10  # batches running
@@ -136,6 +137,7 @@ def make_collector(config: DictConfig, task: Task) -> TrajectoryGroupCollector:
         task.actor,
         num_groups=config.num_groups,
         group_size=config.group_size,
+        max_steps=max(ENDLESS, config.env.get("max_steps") or 0),
         # The loss computes them anew; they are most of a batch.
         exclude_keys=["logits", "loc", "scale", "parameters", "params"],
         **options,

@@ -120,7 +120,8 @@ class Workers:
         for future in done:
             if future.exception() is not None:  # others may be playing still
                 self._result(self._playing[future], future)
-        finished = done if self._sync else [next(iter(done))]
+        # The one that began first: any other could leave it waiting for ever.
+        finished = done if self._sync else [next(one for one in self._playing if one in done)]
         played = sorted(((self._playing.pop(one), one) for one in finished), key=itemgetter(0))
         if not self._sync:
             self._begin(played[0][0])

@@ -37,9 +37,14 @@ def with_pixels(name: str, make: Callable[..., EnvBase]) -> EnvBase:
 
 @torch.no_grad()
 def greedy_episodes(env: EnvBase, policy: Any, count: int) -> list[TensorDictBase]:
-    """Whole episodes ``[T]`` with the most probable actions, one after another."""
+    """Whole episodes ``[T]`` with the most probable actions, the first one with its pictures."""
+    pictures: list[Any] = [("next", "pixels")]  # most of the memory
+    episodes = []
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        return [env.rollout(LONGEST_EPISODE, policy) for _ in range(count)]
+        for _ in range(count):
+            episodes.append(env.rollout(LONGEST_EPISODE, policy).exclude(*pictures))
+            pictures = ["pixels", ("next", "pixels")]
+    return episodes
 
 
 def save_gif(file: Path, episode: TensorDictBase) -> None:

@@ -9,6 +9,7 @@ import argparse
 import csv
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -95,7 +96,8 @@ def final(steps: np.ndarray, values: np.ndarray) -> np.ndarray:
         >>> final(np.array([10, 90, 95, 100]), np.array([[0.0, 1.0, 2.0, 4.0]])).tolist()
         [3.0]
     """
-    return values[:, steps > 0.9 * steps[-1]].mean(axis=1)
+    is_late = (steps > 0.9 * steps[-1]) | (steps == steps[-1])
+    return values[:, is_late].mean(axis=1)
 
 
 def _with_error(values: np.ndarray) -> str:
@@ -134,6 +136,7 @@ def load_comparison(
             the run; by default they are taken as measured.
 
     Raises:
+        FileNotFoundError: if a run has no ``config.yaml``.
         KeyError: if a run has no such metric or entry.
         ValueError: if a run has no value yet, or the runs of a method do not overlap.
     """
@@ -185,6 +188,8 @@ def align(curves: Sequence[np.ndarray], method: str) -> Curve:
 
 
 def _method(run: Path, by: Sequence[str]) -> str:
+    if not (run / "config.yaml").is_file():
+        raise FileNotFoundError(f"There is no config.yaml in {run}: is it the directory of a run?")
     config = OmegaConf.load(run / "config.yaml")
     absent = object()
     values = [OmegaConf.select(config, entry, default=absent) for entry in by]
@@ -202,8 +207,9 @@ def _unit(run: Path) -> str:
 
 
 def _is_unfinished(run: Path) -> bool:
-    summary = run / "summary.json"  # which a run that was killed has not written
-    return not summary.is_file() or not json.loads(summary.read_text())["finished"]
+    with suppress(FileNotFoundError, ValueError):  # what a run that was killed has not written
+        return not json.loads((run / "summary.json").read_text())["finished"]
+    return True
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -41,7 +41,9 @@ METRICS_FILE = "metrics.csv"
 """Name of the record in the directory of a run."""
 LOCK = ".lock"
 PATIENCE = 5.0  # seconds that what a killed run has left behind may hold its lock
-BEGUN = {"config.yaml", "versions.json", "command.txt", LOCK}
+BEGUN = {"config.yaml", "versions.json", "command.txt", "replay_buffer", LOCK}
+TOLD = (ValueError, LookupError, OSError, ImportError, CheckpointError)
+"""Errors whose message is all that a user needs, if they come before a run has begun."""
 BACKENDS = ("csv", "tensorboard", "wandb")
 RECORDED_PACKAGES = ("torchrl-ecpo", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
 
@@ -116,11 +118,7 @@ class MetricsTable:
             return stat.st_ino, stat.st_size, stat.st_mtime_ns
 
     def _rewrite(self, text: str) -> None:
-        """Write another file first, so that a run which is killed meanwhile loses no row."""
-        written = self.path.with_suffix(".part")
-        with written.open("w", newline="") as file:
-            file.write(text)
-        os.replace(written, self.path)
+        _write(self.path, text)
         self._sha256 = hashlib.sha256(text.encode())
         self._written = self._stat()
 
@@ -254,8 +252,7 @@ class Run:
         self.step = 0
         self._latest: dict[str, float] = {}
         # At once, as others read it while runs go on.
-        OmegaConf.save(config, self.directory / "config.yaml.part", resolve=True)
-        os.replace(self.directory / "config.yaml.part", self.directory / "config.yaml")
+        _write(self.directory / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
         _write_json(self.directory / "versions.json", _versions())
         with (self.directory / "command.txt").open("a" if config.get("resume") else "w") as file:
             file.write(f"{shlex.join(command_line())}\n")
@@ -388,10 +385,11 @@ def leaving_nothing(main: Callable[[DictConfig], None]) -> Callable[[DictConfig]
         lock = _lock(Path.cwd())
         try:
             main(config)
-        except (ValueError, LookupError, OSError, ImportError, CheckpointError) as error:
+        except Exception as error:
             has_begun = _clear(_present() - before)
             is_alone = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.RUN
-            if has_begun or not is_alone or "HYDRA_FULL_ERROR" in os.environ:
+            is_told = isinstance(error, TOLD) and "HYDRA_FULL_ERROR" not in os.environ
+            if has_begun or not is_alone or not is_told:
                 raise
             message = error.args[0] if isinstance(error, KeyError) else error
             raise SystemExit(f"{_script()}: {message}") from None
@@ -426,9 +424,11 @@ def _present() -> set[Path]:
 
 def _clear(made: set[Path]) -> bool:
     """Remove what a run has made, with its directory, unless there is more than how it begins."""
-    has_begun = any(path.is_file() and path.name not in BEGUN for path in made)
+    start, here = Path(to_absolute_path(".")), Path.cwd()
+    has_begun = any(
+        path.is_file() and path.relative_to(here).parts[0] not in BEGUN for path in made
+    )
     if not has_begun:
-        start, here = Path(to_absolute_path(".")), Path.cwd()
         for path in sorted(made, reverse=True):
             path.unlink() if path.is_file() else path.rmdir()
         for folder in (here, *here.parents):
@@ -463,4 +463,12 @@ def _commit() -> str:
 
 
 def _write_json(path: Path, content: Mapping[str, object]) -> None:
-    path.write_text(json.dumps(content, indent=2) + "\n")
+    _write(path, json.dumps(content, indent=2) + "\n")
+
+
+def _write(path: Path, text: str) -> None:
+    """Write another file first, so that nobody sees a part, whenever the run is killed."""
+    part = path.with_name(f"{path.name}.part")
+    with part.open("w", newline="") as file:
+        file.write(text)
+    os.replace(part, path)
