@@ -105,7 +105,6 @@ class TrustPCLLoss(LiftProjectLoss):
     tensor_keys: _AcceptedKeys
     value_network: TensorDictModule
     value_network_params: TensorDictParams
-    target_value_network_params: TensorDictParams
 
     def __init__(
         self,
