@@ -11,6 +11,7 @@ import math
 import re
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import pytest
@@ -21,6 +22,8 @@ from omegaconf import OmegaConf
 from PIL import Image
 from processes import run_script
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.data import Bounded
 from torchrl.envs import GymEnv, GymWrapper
 from torchrl.objectives import SACLoss
 
@@ -378,6 +381,17 @@ def test_a_video_that_cannot_be_drawn_says_what_to_install(utils, monkeypatch, e
     with pytest.raises(ValueError, match=f"There is no video of {message}"):
         utils.make_evaluation_environment(config)
     utils.make_environment(config, seed=0)  # training draws nothing
+
+
+def test_noise_is_in_the_unit_of_each_component(utils):
+    spec = Bounded(torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 1.0]), (2,))
+    config, env = (
+        OmegaConf.create({"exploration": 0.2}),
+        SimpleNamespace(action_spec_unbatched=spec),
+    )
+    actor = TensorDictModule(torch.tanh, in_keys=["observation"], out_keys=["action"])
+    noise = utils.make_policy(config, actor, env)[-1]
+    torch.testing.assert_close(noise.std, torch.tensor([0.2, 0.1]))
 
 
 def test_workers_of_different_seeds_share_no_data(utils):

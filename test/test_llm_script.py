@@ -57,6 +57,22 @@ def test_answers_are_verified(modules):
             assert len(answer) < task.max_tokens  # the end is a token
 
 
+def test_an_answer_with_an_unknown_token_is_wrong(modules):
+    """What is after the end is no part of it."""
+    utils = modules("utils")
+    model, tokenizer = utils.make_model(
+        OmegaConf.create({"path": None, "hidden_size": 16, "layers": 1})
+    )
+    policy = utils.Policy(model, tokenizer, modules("tasks").TASKS["countdown"])
+    tokens = policy.tokenizer("5+8<end>").input_ids
+    unknown = policy.tokenizer.unk_token_id
+    rows = [[*tokens, 9, 0], [tokens[0], unknown, *tokens[1:]], [0, *tokens]]
+    assert policy.decode(rows) == ["5+8", "5<unk>+8", "5+8"]
+    assert policy.decode(torch.tensor([[*tokens, 0]])) == ["5+8"]
+    options = ["env=countdown", "loss=pmd", "loss.tau_prime=0.05"]
+    assert compose_options(SCRIPT.parent, options).loss.tau_prime == 0.05
+
+
 def test_pass_at_k_by_hand(modules):
     """Of four answers one is right: a draw of two has it with probability 1 - 3/4 * 2/3."""
     pass_at = modules("utils").pass_at

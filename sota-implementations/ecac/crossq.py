@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import BatchRenorm1d, ValueOperator
 
-WARM_UP = 100_000  # updates of batch normalisation alone; of the paper's code
+WARM_UP = 100_000  # updates of batch normalisation alone; of sbx's CrossQ
 
 
 class Renorm(BatchRenorm1d):
@@ -26,7 +26,7 @@ class Renorm(BatchRenorm1d):
 
 
 class Critic(nn.Module):
-    """What goes into each layer is normalised, the inputs too: Bhatt et al. 2024, Figure 2."""
+    """What goes into each layer is normalised, the inputs too, as in Bhatt et al. 2024."""
 
     def __init__(self, sizes: Sequence[int]) -> None:
         super().__init__()

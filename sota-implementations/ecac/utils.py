@@ -283,7 +283,7 @@ def make_policy(config: DictConfig, actor: Any, env: EnvBase) -> TensorDictModul
         env.action_spec_unbatched,
         sigma_init=1.0,
         sigma_end=1.0,
-        std=config.exploration * _half_range(env.action_spec_unbatched),
+        std=(config.exploration * _half_range(env.action_spec_unbatched)).tolist(),
     )
     return TensorDictSequential(actor, noise)
 
@@ -294,8 +294,8 @@ def _observation_size(env: EnvBase) -> Any:
     return shape if len(shape) > 1 else shape[0]
 
 
-def _half_range(action_spec: Any) -> float:
-    return float((action_spec.space.high - action_spec.space.low).max() / 2)
+def _half_range(action_spec: Any) -> Tensor:
+    return (action_spec.space.high - action_spec.space.low) / 2
 
 
 def _plain(setting: DictConfig) -> Any:

@@ -44,6 +44,11 @@ class Logged(TrainerCallback):
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
 @leaving_nothing
 def main(config: DictConfig) -> None:
+    if config.resume not in (None, "auto"):
+        raise ValueError(
+            f"resume={config.resume}: by_trl.py writes no checkpoints, and would begin anew there. "
+            "Leave out resume."
+        )
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     task = TASKS[config.env]
@@ -89,6 +94,7 @@ def main(config: DictConfig) -> None:
             optimizers=(torch.optim.Adam(model.parameters(), lr=config.optim.lr), None),
         )
         trainer.train()
+        model.eval()
         run.log(policy.evaluate(config.evaluation), step=batches * batch_size)
 
 

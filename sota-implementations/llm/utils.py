@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection
+from itertools import takewhile
 from math import comb
 from pathlib import Path
 from random import Random
@@ -113,9 +114,14 @@ class Policy:
             optimizer.step()
 
     def decode(self, response: Tensor | list[list[int]]) -> list[str]:
-        """Tokens as text, without end and padding."""
-        texts = self.tokenizer.batch_decode(response, skip_special_tokens=True)
-        return ["".join(text.split()) for text in texts]
+        """Tokens as text up to the end, without padding; of an unknown token there is a trace."""
+        rows = response.tolist() if isinstance(response, Tensor) else response
+        end, padding = self.tokenizer.eos_token_id, self.tokenizer.pad_token_id
+        answers = [
+            [token for token in takewhile(lambda token: token != end, row) if token != padding]
+            for row in rows
+        ]
+        return ["".join(text.split()) for text in self.tokenizer.batch_decode(answers)]
 
     def complete(self, prompts: list[str], count: int) -> list[str]:
         """`count` answers to each, by the bare model: the wrapper needs twice the time."""

@@ -325,6 +325,18 @@ def test_other_distributions(settings, words):
             ECPOLoss(actor)
 
 
+def test_padding_that_ends_a_completion_is_not_drawn():
+    """As of models with several ends, one of which is the padding."""
+    model = tiny.make_model()
+    sampler = tiny.make_sampler(model)
+    model.generation_config.eos_token_id = [1, 0]
+    check_sampler(sampler)
+    model.generation_config.suppress_tokens = None
+    message = r"padding token, 0, is among .*eos_token_id=\[1, 0\].*suppress_tokens=\[0\]"
+    with pytest.raises(ValueError, match=message):
+        check_sampler(sampler)
+
+
 def test_top_k_of_transformers():
     """Without top_k, transformers draws from 50 tokens: harmless where there are no more."""
     settings = {"do_sample": True}

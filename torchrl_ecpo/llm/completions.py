@@ -89,7 +89,8 @@ def check_sampler(sampler: Any) -> None:
     Raises:
         ValueError: for greedy decoding (the default of transformers), a temperature other than 1,
             top-k (by default, transformers draws from the 50 likeliest tokens), top-p, min-p or a
-            repetition penalty, be it the wrapper's or of the model's ``generation_config``.
+            repetition penalty, be it the wrapper's or of the model's ``generation_config``; and
+            where the padding token is one of those that end a completion there.
 
     Examples:
         >>> from types import SimpleNamespace
@@ -112,7 +113,21 @@ def check_sampler(sampler: Any) -> None:
             )
         if settings["top_k"] >= sampler.model.config.vocab_size:
             settings["top_k"] = 0
+        _check_ends(sampler, config)
     _check_settings(settings)
+
+
+def _check_ends(sampler: Any, config: Any) -> None:
+    """Refuse padding that ends a completion: it would be drawn, and count for nothing."""
+    padding = getattr(getattr(sampler, "tokenizer", None), "pad_token_id", None)
+    ends = getattr(config, "eos_token_id", None)
+    ends = ends if isinstance(ends, (list, tuple)) else [ends]
+    suppressed = getattr(config, "suppress_tokens", None) or ()
+    if padding is not None and padding in ends and padding not in suppressed:
+        raise ValueError(
+            f"The padding token, {padding}, is among generation_config.eos_token_id={ends}: an end "
+            f"of a completion would count for nothing: set its suppress_tokens=[{padding}]."
+        )
 
 
 def _settings(wrapper: Any) -> dict[str, Any]:
@@ -309,7 +324,8 @@ def _logits(actor: Any, rows: TensorDictBase) -> tuple[Tensor, Tensor]:
         if (begins > 1).any():
             raise ValueError(
                 f"{int((begins > 1).sum())} completions have padding between their tokens "
-                f"({attention_key!r}): the sampler drew a padding token before the end. Drop "
+                f"({attention_key!r}). If prompts were padded on the right, set the tokenizer's "
+                "padding_side='left'. Else the sampler drew a padding token before the end: drop "
                 "them, or keep the sampler from it, with suppress_tokens for example."
             )
     return distribution.logits, attention
