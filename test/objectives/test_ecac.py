@@ -547,3 +547,9 @@ def test_actions_by_number_and_one_hot():
         nn.functional.one_hot(number, CHOICES).bool(),
     ):
         assert_close(call(loss, batch.set("action", action)), expected)
+
+
+@pytest.mark.parametrize("projection", ["centred", "gradient"])
+def test_all_actions_have_no_estimator(projection):
+    with pytest.raises(ValueError, match=f"projection must be one of .*'paper'.*got {projection!r}"):
+        DISCRETE.build(projection=projection)

@@ -305,8 +305,10 @@ class DiscreteECACLoss(ECACLoss):
         target_kl: float | None = 0.1,
         target_entropy: float | Literal["auto"] | None = None,
         target_entropy_weight: float = 0.98,
+        projection: Literal["paper"] = "paper",
         **options: Any,
     ) -> None:
+        check_choice("projection", projection, ("paper",))
         super().__init__(
             actor_network,
             qvalue_network,
@@ -314,7 +316,7 @@ class DiscreteECACLoss(ECACLoss):
             tau_prime=tau_prime,
             target_kl=target_kl,
             target_entropy=target_entropy,
-            projection="paper",
+            projection=projection,
             **options,
         )
         self.target_entropy_weight = as_share("target_entropy_weight", target_entropy_weight)

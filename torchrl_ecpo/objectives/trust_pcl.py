@@ -105,6 +105,7 @@ class TrustPCLLoss(LiftProjectLoss):
     tensor_keys: _AcceptedKeys
     value_network: TensorDictModule
     value_network_params: TensorDictParams
+    target_value_network_params: TensorDictParams  # TorchRL warns of a network without it
 
     def __init__(
         self,
