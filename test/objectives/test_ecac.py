@@ -551,5 +551,7 @@ def test_actions_by_number_and_one_hot():
 
 @pytest.mark.parametrize("projection", ["centred", "gradient"])
 def test_all_actions_have_no_estimator(projection):
-    with pytest.raises(ValueError, match=f"projection must be one of .*'paper'.*got {projection!r}"):
+    with pytest.raises(
+        ValueError, match=f"projection must be one of .*'paper'.*got {projection!r}"
+    ):
         DISCRETE.build(projection=projection)
