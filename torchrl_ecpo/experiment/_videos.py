@@ -38,13 +38,12 @@ def with_pixels(name: str, make: Callable[..., EnvBase]) -> EnvBase:
 @torch.no_grad()
 def greedy_episodes(env: EnvBase, policy: Any, count: int) -> list[TensorDictBase]:
     """Whole episodes ``[T]`` with the most probable actions, the first one with its pictures."""
-    pictures: list[Any] = [("next", "pixels")]  # most of the memory
-    episodes = []
+    twice: Any = ("next", "pixels")
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        for _ in range(count):
-            episodes.append(env.rollout(LONGEST_EPISODE, policy).exclude(*pictures))
-            pictures = ["pixels", ("next", "pixels")]
-    return episodes
+        return [
+            env.rollout(LONGEST_EPISODE, policy).exclude(twice, *(["pixels"] if index else []))
+            for index in range(count)  # pictures are most of the memory
+        ]
 
 
 def save_gif(file: Path, episode: TensorDictBase) -> None:

@@ -236,7 +236,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             runs, options.metric, by=options.by, smoothing=options.smoothing
         )
     except (FileNotFoundError, KeyError, ValueError) as error:
-        parser.error(error.args[0])
+        # A KeyError in words has quotes; the first argument of a system's error is its number.
+        parser.error(error.args[0] if isinstance(error, KeyError) else str(error))
     print(comparison.table())
     for run in filter(_is_unfinished, runs):
         print(f"not finished, and curves are as long as the shortest one: {run}")
