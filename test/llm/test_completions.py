@@ -17,6 +17,7 @@ from torchrl.data.replay_buffers.samplers import PromptGroupSampler
 from torchrl.modules.distributions import LLMMaskedCategorical
 from torchrl.objectives.llm import GRPOLoss as TorchRLGRPOLoss
 from torchrl.objectives.llm import MCAdvantage
+from transformers import GPT2Config, GPT2LMHeadModel
 
 from torchrl_ecpo import (
     ECPOLoss,
@@ -335,6 +336,16 @@ def test_padding_that_ends_a_completion_is_not_drawn():
     message = r"padding token, 0, is among .*eos_token_id=\[1, 0\].*suppress_tokens=\[0\]"
     with pytest.raises(ValueError, match=message):
         check_sampler(sampler)
+
+
+def test_a_model_that_the_wrapper_calls_wrongly():
+    """GPT-2's second argument is its cache, which fails inside of transformers."""
+    sizes = {"n_embd": 32, "n_layer": 1, "n_head": 2, "vocab_size": len(tiny.WORDS)}
+    sizes |= {"bos_token_id": None, "eos_token_id": END}
+    model = GPT2LMHeadModel(GPT2Config(**sizes))
+    message = "GPT2LMHeadModel.forward takes [a-z_]+ where TorchRL's wrapper passes"
+    with pytest.raises(ValueError, match=message):
+        check_sampler(tiny.make_sampler(model))
 
 
 def test_top_k_of_transformers():

@@ -6,6 +6,7 @@ completion together. Shorter ones are padded on the left, as the wrappers do.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -89,8 +90,9 @@ def check_sampler(sampler: Any) -> None:
     Raises:
         ValueError: for greedy decoding (the default of transformers), a temperature other than 1,
             top-k (by default, transformers draws from the 50 likeliest tokens), top-p, min-p or a
-            repetition penalty, be it the wrapper's or of the model's ``generation_config``; and
-            where the padding token is one of those that end a completion there.
+            repetition penalty, be it the wrapper's or of the model's ``generation_config``;
+            where the padding token is one of those that end a completion there; and for a model
+            that the wrapper calls wrongly, such as GPT-2.
 
     Examples:
         >>> from types import SimpleNamespace
@@ -114,7 +116,19 @@ def check_sampler(sampler: Any) -> None:
         if settings["top_k"] >= sampler.model.config.vocab_size:
             settings["top_k"] = 0
         _check_ends(sampler, config)
+        _check_arguments(sampler.model)
     _check_settings(settings)
+
+
+def _check_arguments(model: Any) -> None:
+    """Refuse a model whose attention mask TorchRL's wrapper would pass for something else."""
+    second = [*inspect.signature(model.forward).parameters][1:2]
+    if second not in ([], ["attention_mask"], ["args"]):
+        raise ValueError(
+            f"{type(model).__name__}.forward takes {second[0]} where TorchRL's wrapper passes the "
+            "attention mask, second. Take a model that has its mask there, as Llama, Qwen, OPT and "
+            "GPT-NeoX have it."
+        )
 
 
 def _check_ends(sampler: Any, config: Any) -> None:
