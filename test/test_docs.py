@@ -247,7 +247,10 @@ def test_the_page_of_equations_names_tests_that_exist():
         assert set(re.findall(r"`(test_\w+)`", row)) <= defined, row
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/results.md", "docs/searches.md"])
+@pytest.mark.parametrize(
+    "page",
+    ["README.md", *(f"docs/{name}.md" for name in ("results", "exploration", "control", "searches"))],
+)
 def test_sentences_are_short_and_results_are_read_in_one_go(page):
     text = sentences(ROOT / page)
     assert median(map(len, text)) <= 16

@@ -766,7 +766,7 @@ STATED = re.compile(r"(-?[\d,.]+) ± ([\d,.]+)(?: \((.+)\))?")
     ("page", "names", "heading"),
     [
         ("docs/results.md", ("first_bandit", "first_tasks"), r"task \| trajectories"),
-        ("docs/results.md", ("figure2",), r"task[^|]*(?:\| runs )?\| ECAC"),
+        ("docs/control.md", ("figure2",), r"task[^|]*(?:\| runs )?\| ECAC"),
     ],
 )
 def test_the_tables_of_results_state_what_is_committed(study, page, names, heading):
