@@ -22,7 +22,8 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [
     *sorted(page for page in DOCS.rglob("*.md") if DOCS / "_build" not in page.parents),
-    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "benchmarks/README.md")),
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")),
+    *(ROOT / name / "README.md" for name in ("benchmarks", "sota-implementations")),
 ]
 PAGES_WITH_DEFAULTS = [
     *(page for page in PAGES if page.parent.name == "algorithms"),
@@ -249,7 +250,10 @@ def test_the_page_of_equations_names_tests_that_exist():
 
 @pytest.mark.parametrize(
     "page",
-    ["README.md", *(f"docs/{name}.md" for name in ("results", "exploration", "control", "searches"))],
+    [
+        "README.md",
+        *(f"docs/{name}.md" for name in ("results", "exploration", "control", "searches")),
+    ],
 )
 def test_sentences_are_short_and_results_are_read_in_one_go(page):
     text = sentences(ROOT / page)

@@ -159,16 +159,16 @@ def test_there_is_a_word_on_each_choice_and_each_option(script):
 
 
 def test_help_comes_without_torch():
-    """Which takes seconds; hydra and the configuration take less than one."""
+    """Which takes seconds; hydra and the configuration take less than one. Also after options."""
     code = """
 import runpy, sys
 sys.modules["torch"] = None  # importing it fails
-sys.argv = [sys.argv[1], "--help"]
+sys.argv = [*sys.argv[1:], "--help"]
 runpy.run_path(sys.argv[0], run_name="__main__")
 """
-    for script in ("ecpo", "ecac", "llm"):
+    for script, *options in (("ecpo",), ("ecac", "env=minatar"), ("llm",)):
         path = SCRIPTS / script / f"{script}.py"
-        command = [sys.executable, "-c", code, str(path)]
+        command = [sys.executable, "-c", code, str(path), *options]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(path.parent), *sys.path])}
         process = subprocess.run(
             command, capture_output=True, text=True, check=False, env=environment

@@ -12,7 +12,7 @@ from choice import chosen_loss
 from torchrl_ecpo.experiment.options import check_command_line
 
 if __name__ == "__main__":  # before torch is imported, which takes seconds
-    sys.argv += chosen_loss(sys.argv[1:])
+    sys.argv[1:1] = chosen_loss(sys.argv[1:])  # before options and flags alike
     check_command_line(__file__)
 
 import hydra

@@ -165,11 +165,11 @@ def test_the_regret_of_wrong_temperatures_is_above_the_bound():
     """Large temperatures all along: the policy stays where it was. So the bound can be broken."""
     n, horizon = 10, 200
     reward = fixed_rewards(n).expand(2, -1, -1)
-    start = uniform(Simplex(), *reward.shape)
+    policy = uniform(Simplex(), *reward.shape)
     regret = torch.zeros(reward.shape[:-1], dtype=torch.float64)
     for t in range(1, horizon + 1):
         wrong = choices(t, horizon, n=n).flip(0)
-        policy = lift_and_project(start, reward, Simplex(), wrong)
+        policy = lift_and_project(policy, reward, Simplex(), wrong)
         regret += reward.amax(-1) - (policy * reward).sum(-1)
     assert (regret.amax(-1) > 4 * math.sqrt(horizon * math.log(n))).all()
 
