@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import os
 import pickle
@@ -18,7 +17,7 @@ import pytest
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
-from processes import run_script, start_script
+from processes import record, run_script, start_script
 from tensordict import NonTensorData, TensorDict
 from torchrl.checkpoint import Checkpoint, CheckpointError
 from torchrl.envs import DMControlEnv, GymEnv, TransformedEnv
@@ -52,7 +51,7 @@ RUNS = {
     ),
     "hopper": (
         *(*CONTROL, "env=hopper", ECAC_STATES),
-        *("loss.reference_interval=5", "replay_buffer.size=100"),
+        *("loss.reference_interval=5", "replay_buffer.size=100", "updates_per_frame=0.5"),
     ),
     "memmap": (
         *(*CONTROL, "env=pendulum", "loss=td3", "replay_buffer.storage=memmap"),
@@ -88,15 +87,6 @@ def start(run_here, monkeypatch):
 
 class Killed(Exception):
     """Ends a run with nothing but what is on the disk."""
-
-
-def record(directory):
-    """The rows of a run as they are written, but for the clock."""
-    with (directory / "metrics.csv").open(newline="") as file:
-        return [
-            {name: cell for name, cell in row.items() if name != "steps_per_second"}
-            for row in csv.DictReader(file)
-        ]
 
 
 def checkpoints(directory):
@@ -139,15 +129,37 @@ def test_a_resumed_run_equals_one_that_was_never_stopped(tmp_path, start, capfd,
     assert_same_run(parts, whole)
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Where runs are kept that several tests begin with, or compare with."""
+    return tmp_path_factory.mktemp("made")
+
+
 @pytest.fixture
-def interrupted(tmp_path, start):
+def interrupted(tmp_path, start, made):
     """The directory of a run with a checkpoint, which was killed two rows later."""
-    with pytest.raises(Killed):
-        start(tmp_path, *RUNS["bandit"], save_at=4, kill_at=6)
-    return tmp_path
+    if not (made / "interrupted").exists():
+        with pytest.raises(Killed):
+            start(made / "interrupted", *RUNS["bandit"], save_at=4, kill_at=6)
+    return shutil.copytree(made / "interrupted", tmp_path, dirs_exist_ok=True)
 
 
-def test_a_full_disk_ends_the_run_and_leaves_the_last_checkpoint(interrupted, start, monkeypatch):
+@pytest.fixture
+def left_alone(start, made):
+    """The directory of a run of the bandit that was never stopped, with these options."""
+
+    def left_alone(*options):
+        directory = made / "_".join(["whole", *options])
+        if not directory.exists():
+            start(directory, *RUNS["bandit"], *options)
+        return directory
+
+    return left_alone
+
+
+def test_a_full_disk_ends_the_run_and_leaves_the_last_checkpoint(
+    interrupted, left_alone, start, monkeypatch
+):
     def fill(state, path):
         path.write_bytes(b"half")
         raise OSError(28, "No space left on device")
@@ -160,8 +172,7 @@ def test_a_full_disk_ends_the_run_and_leaves_the_last_checkpoint(interrupted, st
             start(interrupted, *run, save_at=2)
     assert [path.name[-2:] for path in checkpoints(interrupted)] == ["20"]
     start(interrupted, *run)
-    start(interrupted / "whole", *RUNS["bandit"])
-    assert_same_run(interrupted, interrupted / "whole")
+    assert_same_run(interrupted, left_alone())
 
 
 def flip_a_bit(directory):
@@ -409,7 +420,9 @@ def test_a_second_signal_does_not_wait(tmp_path):
 
 
 @pytest.mark.parametrize("save_at", [None, 1])
-def test_a_new_run_in_an_old_directory_forgets_the_old_one(interrupted, start, capfd, save_at):
+def test_a_new_run_in_an_old_directory_forgets_the_old_one(
+    interrupted, left_alone, start, capfd, save_at
+):
     """One that is killed before its first checkpoint is begun again."""
     with pytest.raises(Killed):
         start(interrupted, *RUNS["bandit"], "seed=8", save_at=save_at, kill_at=2)
@@ -419,8 +432,7 @@ def test_a_new_run_in_an_old_directory_forgets_the_old_one(interrupted, start, c
     start(interrupted, *RUNS["bandit"], "seed=8", "resume=auto")
     begins = "resume=auto found no checkpoint: a new run begins" in capfd.readouterr().out
     assert begins is (save_at is None)
-    start(interrupted / "whole", *RUNS["bandit"], "seed=8")
-    assert_same_run(interrupted, interrupted / "whole")
+    assert_same_run(interrupted, left_alone("seed=8"))
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ from functools import partial
 
 import cloudpickle
 import pytest
-import ray
 import torch
 from tensordict import TensorDict
 from tensordict import assert_close as assert_td_close
@@ -600,8 +599,7 @@ def test_bad_environments(env, error, match):
 
 
 # Workers do not find this module: what they need of it travels by value.
-for pickle in (cloudpickle, ray.cloudpickle):
-    pickle.register_pickle_by_value(sys.modules[__name__])
+cloudpickle.register_pickle_by_value(sys.modules[__name__])
 
 
 @pytest.mark.parametrize("sync", [True, False])
@@ -687,6 +685,9 @@ def test_workers_that_play_frames_number_their_own_trajectories():
 
 
 def test_ray_workers():
+    import ray
+
+    ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
     policy = linear_policy()
     collector = TrajectoryGroupCollector(
         Countdown, policy, num_groups=4, group_size=3, backend="ray", num_collectors=2, sync=True,

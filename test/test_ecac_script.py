@@ -40,6 +40,7 @@ TINY = (
     "collector.init_random_frames=80",
     "hidden_sizes=[16,16]",
     "replay_buffer.batch_size=32",
+    "updates_per_frame=0.25",
     "loss.num_actor_states=16",
 )
 LOSSES = ("ecac", "pmd_ac", "mpo", "sac", "sac_score", "tqc", "crossq", "td3", "ddpg")
@@ -282,6 +283,7 @@ def test_one_discrete_action_has_a_loss_of_its_own(tmp_path, train):
 def test_a_game_of_minatar_and_fewer_updates_than_frames(tmp_path, train):
     pytest.importorskip("minatar")
     game = ("env=minatar", "env.name=MinAtar/Freeway-v1", "loss=discrete_ecac")
+    assert configure(game[:2]).updates_per_frame == 0.25
     metrics = train(tmp_path, *game)
     assert metrics["step"][-1] == 240
     assert all(map(math.isfinite, metrics["loss_actor"][1:]))

@@ -208,6 +208,8 @@ def test_steps_grow_also_after_resuming(tmp_path, number):
     for each in (run, resumed):
         with pytest.raises(ValueError, match=r"step must grow, got 20(\.0)? after"):
             each.log({"return": 1.0}, number(20))
+    with pytest.raises(ValueError, match="metric cannot be called step"):
+        resumed.log({"step": 1.0}, number(25))
     resumed.log({"return": 1.0}, number(25))
     assert path.read_text().split()[-1] == f"{number(25)},1.0"
 

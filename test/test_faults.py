@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import importlib
 import os
 import random
@@ -20,6 +19,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from processes import record
 from torchrl.checkpoint import Checkpoint, CheckpointError
 
 from torchrl_ecpo.experiment import Checkpoints
@@ -81,14 +81,6 @@ def finish(directory, *run):
     """Run to the end; return the exit status and what was printed."""
     _, status = os.waitpid(fork(directory, *run), 0)
     return os.waitstatus_to_exitcode(status), (directory / "log").read_text()
-
-
-def record(directory):
-    with (directory / "metrics.csv").open(newline="") as file:
-        return [
-            {name: cell for name, cell in row.items() if name != "steps_per_second"}
-            for row in csv.DictReader(file)
-        ]
 
 
 def number_of_rows(directory):

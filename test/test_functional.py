@@ -722,11 +722,10 @@ def test_leading_shapes_and_sample_dim(name, shape, masked):
 
 @DTYPES
 @every_function
-@pytest.mark.parametrize("masked", [False, True])
-def test_dtype_is_kept(name, dtype, masked):
+def test_dtype_is_kept(name, dtype):
     """That of the scores, also where temperatures are tensors of another."""
     x = random_samples(2, 4, dtype=dtype)
-    mask = torch.tensor([True, True, False, True]).expand(2, 4) if masked else None
+    mask = torch.tensor([True, True, False, True]).expand(2, 4)
     double = evaluate(name, x.map(Tensor.double), mask=mask)
     for temperatures in ((0.5, 0.25), torch.tensor([0.5, 0.25]), vector(0.5, 0.25)):
         value, per_sample = evaluate(name, x, *temperatures, mask=mask)
@@ -769,11 +768,10 @@ def test_finite_input_never_gives_nan(name, data, dtype, tau, tau_prime):
 
 @DTYPES
 @every_surrogate
-@pytest.mark.parametrize("masked", [False, True])
-def test_the_largest_numbers_never_give_nan(name, dtype, masked):
+def test_the_largest_numbers_never_give_nan(name, dtype):
     largest = torch.finfo(dtype).max
-    mask = torch.tensor([True, True, False]) if masked else None
-    for signs in itertools.product((-1, 1), repeat=3):
+    masks = (None, torch.tensor([True, True, False]))
+    for mask, *signs in itertools.product(masks, *[(-1, 1)] * 3):
         score = largest * vector(*signs, dtype=dtype)
         for log_prob, reference in itertools.permutations([(-1.0, -200.0, -3.0), (-200.0,) * 3], 2):
             log_prob, reference = vector(*log_prob, dtype=dtype), vector(*reference, dtype=dtype)
@@ -1197,7 +1195,7 @@ def _two_humps(u: Tensor) -> Tensor:
 @pytest.mark.parametrize("start", [(4.0, 0.3), (-3.0, 2.0)], ids=str)
 def test_both_projections_have_the_same_minimiser(log_density, start):
     """Mean and variance of the target, by quadrature; and descent arrives there."""
-    grid = torch.linspace(-12, 12, 20_001, dtype=torch.float64)
+    grid = torch.linspace(-12, 12, 10_001, dtype=torch.float64)
     log_weights = log_density(grid)
     weights = log_weights.softmax(0)
     mean = (weights * grid).sum()
@@ -1208,7 +1206,7 @@ def test_both_projections_have_the_same_minimiser(log_density, start):
         grad = gaussian_gradient(*at, sample_dim=0)
         assert_close((grad.mean.item(), grad.log_scale.item()), (0.0, 0.0), **tolerance)
         loc, log_scale = vector(start[0]), vector(math.log(start[1]))
-        for _ in range(300):
+        for _ in range(120):
             at[1], at[2] = loc, log_scale.exp()
             grad = gaussian_gradient(*at, sample_dim=0)
             # Newton's steps, shortened: units of the policy's own scale.

@@ -313,7 +313,16 @@ def test_play_shows_runs_that_are_not_algorithmic(sweep, script, train, tmp_path
 
 
 @pytest.mark.parametrize(
-    "name", ["FrozenLake-v1", "Blackjack-v1", "CliffWalking-v1", "Taxi-v4", "Acrobot-v1"]
+    "name",
+    [
+        "Blackjack-v1",
+        # Whose spaces are those of FrozenLake and MountainCar, in the test of exploration.
+        *(
+            pytest.param(f"{name}-v1", marks=pytest.mark.slow)
+            for name in ("CliffWalking", "Acrobot")
+        ),
+        pytest.param("Taxi-v4", marks=pytest.mark.slow),
+    ],
 )
 def test_the_toy_tasks_of_gymnasium_train(tmp_path, train, name):
     """Their observations are numbers, and tuples of these, and vectors."""

@@ -49,12 +49,10 @@ CLASSES = [
 RECORDS = (tuple, SimpleNamespace)  # they check nothing
 
 
-@pytest.mark.parametrize("kind", CLASSES, ids=lambda kind: kind.__name__)
-def test_a_public_class_has_an_example_and_says_what_it_raises(kind):
-    text = kind.__doc__ or ""
-    assert "Examples:\n" in text
-    is_record = issubclass(kind, RECORDS) or dataclasses.is_dataclass(kind)
-    assert is_record or "Raises:\n" in text
+def test_a_public_class_has_an_example_and_says_what_it_raises():
+    assert [kind for kind in CLASSES if "Examples:\n" not in (kind.__doc__ or "")] == []
+    silent = [kind for kind in CLASSES if "Raises:\n" not in (kind.__doc__ or "")]
+    assert [k for k in silent if not (issubclass(k, RECORDS) or dataclasses.is_dataclass(k))] == []
 
 
 class Page(HTMLParser):

@@ -391,6 +391,10 @@ def test_a_directory_with_another_configuration_is_not_touched(study, run, tmp_p
     status, output = run(path)
     assert status == 1
     assert "another configuration: new_option was absent, is 7. Remove it" in output
+    status, output = run(path, "--dry-run")
+    assert status == 1
+    assert "failed (" in output
+    assert "new_option was absent" in output
     assert "is done" in run(path, "--ignore", "new_option")[1]
 
 

@@ -405,7 +405,14 @@ class TestCheckpoints:
             (half, averages.state_dict(), r"entries \['averages', 'initialized'\], got \['ini"),
             (sequence, copies.state_dict(), "one entry, 'updaters', with 2 states"),
             (sequence, {"updaters": [copies.state_dict()]}, "one entry, 'updaters', with 2"),
+            (
+                sequence,
+                {"updaters": [{"initialized": True, "counter": 7}, {"initialized": "no"}]},
+                "initialized must be",
+            ),
         ]
         for updater, state, message in refused:
+            before = updater.state_dict()
             with pytest.raises(ValueError, match=message):
                 updater.load_state_dict(state)
+            torch.testing.assert_close(updater.state_dict(), before)

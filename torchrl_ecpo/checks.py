@@ -205,27 +205,19 @@ def present(tensordict: TensorDictBase) -> str:
     return ", ".join(sorted(map(repr, tensordict.keys(True, True))))
 
 
-def as_float(name: str, value: Any) -> float:
-    """A number from an option; no text, and no flag."""
+def as_float(name: str, value: Any, interval: str = "") -> float:
+    """A number from an option; no text, and no flag. In an interval such as "(0, 1]", if given."""
     try:
         if isinstance(value, (str, bool)):
             raise TypeError
-        return float(value)
+        number = float(value)
     except (TypeError, ValueError, RuntimeError):
         raise ValueError(f"{name} must be a number, got {value!r}.") from None
-
-
-def as_fraction(name: str, value: Any) -> float:
-    """A number from 0 to 1, such as a discount."""
-    number = as_float(name, value)
-    if not 0 <= number <= 1:
-        raise ValueError(f"{name} must be in [0, 1], got {number}.")
-    return number
-
-
-def as_share(name: str, value: Any) -> float:
-    """A number between 0 and 1, neither of them."""
-    number = as_float(name, value)
-    if not 0 < number < 1:
-        raise ValueError(f"{name} must be in (0, 1), got {number}.")
+    if interval:
+        low, high = map(float, interval[1:-1].split(","))
+        is_left_out = (number == low and interval[0] == "(") or (
+            number == high and interval[-1] == ")"
+        )
+        if not low <= number <= high or is_left_out:
+            raise ValueError(f"{name} must be in {interval}, got {value}.")
     return number

@@ -47,7 +47,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, TypedDict
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -114,11 +114,6 @@ class Surrogate(NamedTuple):
     """Further losses by their full names (``"loss_eta"``), ``[E*]`` or 0-d."""
     metrics: Mapping[str, Tensor] = {}
     """Further metrics by name (``"clip_fraction"``), ``[E*]`` or 0-d."""
-
-
-class _Where(TypedDict):
-    sample_dim: int
-    mask: Tensor | None
 
 
 def _check_samples(
@@ -402,7 +397,7 @@ def mean_seeking_projection(
         log_weights=log_weights,
         control_log_prob=control_log_prob,
     )
-    where: _Where = {"sample_dim": sample_dim, "mask": mask}
+    where: Any = {"sample_dim": sample_dim, "mask": mask}
     weights = self_normalised_weights(log_weights.detach(), **where)
     coefficients = weights
     if control_log_prob is not None:
@@ -696,7 +691,7 @@ def mode_seeking_projection(
         log_weights=log_weights,
         behaviour_log_prob=behaviour_log_prob,
     )
-    where: _Where = {"sample_dim": sample_dim, "mask": mask}
+    where: Any = {"sample_dim": sample_dim, "mask": mask}
     current, reference_log_prob = log_prob.detach(), reference_log_prob.detach()
     behaviour = reference_log_prob if behaviour_log_prob is None else behaviour_log_prob.detach()
     ratios = self_normalised_weights(_representable(current - behaviour), **where)
@@ -755,7 +750,7 @@ def squared_residual_projection(
         log_weights=log_weights,
         behaviour_log_prob=behaviour_log_prob,
     )
-    where: _Where = {"sample_dim": sample_dim, "mask": mask}
+    where: Any = {"sample_dim": sample_dim, "mask": mask}
     reference, log_weights = reference_log_prob.detach(), _representable(log_weights.detach())
     behaviour = reference if behaviour_log_prob is None else behaviour_log_prob.detach()
     weights = self_normalised_weights(_representable(reference - behaviour), **where)
@@ -801,7 +796,7 @@ def group_cross_entropy(
         (tensor(0.6931), tensor([-0.2500,  0.2500]))
     """
     _check_samples(sample_dim, mask, log_prob=log_prob, log_target=log_target)
-    where: _Where = {"sample_dim": sample_dim, "mask": mask}
+    where: Any = {"sample_dim": sample_dim, "mask": mask}
     weights = self_normalised_weights(log_target.detach(), **where)
     normaliser = _masked_logsumexp(log_prob, sample_dim, mask).unsqueeze(sample_dim)
     return Surrogate(weighted_sum(weights, _representable(normaliser - log_prob), **where), weights)
@@ -838,7 +833,7 @@ def urex_surrogate(
     _check_samples(sample_dim, mask, log_prob=log_prob, score=score, tau=tau)
     current, score = log_prob.detach(), score.detach()
     log_weights = lifted_log_weights(score, current, tau=0.0, tau_prime=tau)
-    where: _Where = {"sample_dim": sample_dim, "mask": mask}
+    where: Any = {"sample_dim": sample_dim, "mask": mask}
     weights = self_normalised_weights(log_weights, **where)
     uniform = uniform_weights(log_prob, **where)
     # A masked sample has weight 0 in both, so the quotient's denominator may be anything there.
@@ -873,7 +868,7 @@ def ment_surrogate(
     """
     check_temperatures(tau=tau, allow_zero=True)
     _check_samples(sample_dim, mask, log_prob=log_prob, score=score, tau=tau)
-    where: _Where = {"sample_dim": sample_dim, "mask": mask}
+    where: Any = {"sample_dim": sample_dim, "mask": mask}
     signal = score - tau * log_prob.detach()
     loss = score_function_loss(log_prob, centred(signal, **where), **where)
     return Surrogate(loss, uniform_weights(log_prob, **where))
@@ -1190,7 +1185,7 @@ def masked_mean(
         tensor(2.)
     """
     _check_samples(sample_dim, mask, values=values)
-    where: _Where = {"sample_dim": sample_dim, "mask": mask}
+    where: Any = {"sample_dim": sample_dim, "mask": mask}
     return weighted_sum(uniform_weights(values, **where), values, **where, keepdim=keepdim)
 
 
@@ -1223,7 +1218,7 @@ def standardised(score: Tensor, *, sample_dim: int = -1, mask: Tensor | None = N
         tensor([[-1.,  1.],
                 [ 0.,  0.]])
     """
-    where: _Where = {"sample_dim": sample_dim, "mask": mask}
+    where: Any = {"sample_dim": sample_dim, "mask": mask}
     return _in_deviations(_spread(score, **where), **where)
 
 

@@ -18,7 +18,6 @@ Examples:
 from __future__ import annotations
 
 import inspect
-import math
 from dataclasses import field, make_dataclass
 from typing import Any
 
@@ -72,10 +71,10 @@ class LearningRates(TrainerHookBase):
     """
 
     def __init__(self, **rates: float) -> None:
-        self.rates = {name: as_float(name, rate) for name, rate in rates.items()}
-        for name, rate in self.rates.items():
-            if not 0 <= rate < math.inf:
-                raise ValueError(f"The learning rate {name} must be finite and >= 0, got {rate}.")
+        self.rates = {
+            name: as_float(f"The learning rate {name}", rate, "[0, inf)")
+            for name, rate in rates.items()
+        }
 
     def register(self, trainer: Trainer, name: str = "learning_rates") -> None:
         """Regroup the parameters of the trainer's optimiser."""
@@ -94,13 +93,6 @@ class LearningRates(TrainerHookBase):
             group["params"] = [one for one in group["params"] if id(one) not in moved]
         for owner, rate in self.rates.items():
             optimizer.add_param_group({"params": learned[owner], "lr": rate})
-
-    def state_dict(self) -> dict[str, Any]:
-        """Nothing: the groups are the optimiser's."""
-        return {}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Nothing is loaded."""
 
 
 def make_loss(loss_class: str, **options: Any) -> PolicyLoss:

@@ -123,16 +123,22 @@ class _NetworkUpdater(TargetNetUpdater):
         Raises:
             ValueError: if the entries are not those of this kind of updater.
         """
+        self._check_state(state_dict)
+        if "counter" in state_dict:
+            self.counter = int(state_dict["counter"])
+        self.initialized = bool(state_dict["initialized"])
+
+    def _check_state(self, state_dict: Mapping[str, Any]) -> None:
+        """Refuse a state of another kind, before anything is loaded."""
         expected = self.state_dict()
         if state_dict.keys() != expected.keys():
             raise ValueError(
                 f"The state of a {type(self).__name__} has the entries {sorted(expected)}, got "
                 f"{sorted(state_dict)}: was it saved by another kind of updater?"
             )
-        initialized = check_flag("initialized", state_dict["initialized"])
+        check_flag("initialized", state_dict["initialized"])
         if "counter" in expected:
-            self.counter = check_count("counter", state_dict["counter"], least=0)
-        self.initialized = initialized
+            check_count("counter", state_dict["counter"], least=0)
 
     def _pairs(self) -> Iterator[tuple[str, Tensor, Tensor]]:
         """Yields the name and the data of every network tensor and its copy, buffers included."""
@@ -251,9 +257,7 @@ class PolyakAverage(_NetworkUpdater):
     option = "weight"
 
     def __init__(self, loss_module: LossModule, *networks: str, weight: float = 0.005) -> None:
-        self.weight = as_float("weight", weight)
-        if not 0 < self.weight <= 1:
-            raise ValueError(f"weight must be in (0, 1], got {weight!r}.")
+        self.weight = as_float("weight", weight, "(0, 1]")
         self._averages: dict[str, Tensor] = {}
         super().__init__(loss_module, *networks)
 
@@ -291,8 +295,13 @@ class PolyakAverage(_NetworkUpdater):
         Raises:
             ValueError: if it is not the state of an updater of this kind and of these networks.
         """
-        own, given = self.state_dict().get("averages", {}), state_dict.get("averages", {})
         super().load_state_dict(state_dict)
+        averages = state_dict.get("averages", {})
+        self._averages = {name: average.detach().clone() for name, average in averages.items()}
+
+    def _check_state(self, state_dict: Mapping[str, Any]) -> None:
+        super()._check_state(state_dict)
+        own, given = self.state_dict().get("averages", {}), state_dict.get("averages", {})
         check_kind("averages", given, Mapping)
         wrong = [n for n in own | given if n not in own or not _is_like(given.get(n), own[n])]
         if wrong:
@@ -300,7 +309,6 @@ class PolyakAverage(_NetworkUpdater):
                 f"The averages of {wrong} in the state are missing, not this updater's, or no "
                 "finite single-precision numbers of its shapes: was it saved with other networks?"
             )
-        self._averages = {name: average.detach().clone() for name, average in given.items()}
 
 
 class UpdaterSequence(TargetNetUpdater):
@@ -377,8 +385,14 @@ class UpdaterSequence(TargetNetUpdater):
                 f"The state of this UpdaterSequence has one entry, 'updaters', with "
                 f"{len(self.updaters)} states, got {dict(state_dict)}."
             )
-        for updater, state in zip(self.updaters, states, strict=True):
-            updater.load_state_dict(state)
+        before = self.state_dict()["updaters"]
+        try:
+            for updater, state in zip(self.updaters, states, strict=True):
+                updater.load_state_dict(state)
+        except ValueError:  # the state as a whole is refused
+            for updater, state in zip(self.updaters, before, strict=True):
+                updater.load_state_dict(state)
+            raise
 
     def __repr__(self) -> str:
         lines = "".join(f"    {updater!r},\n" for updater in self.updaters)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -46,17 +45,3 @@ def make_renormalised_critic(
     """Q of an action, for ``CrossQLoss``."""
     critic = Critic([observation_size + action_size, *hidden_sizes, 1])
     return ValueOperator(critic, in_keys=["observation", "action"])
-
-
-class NothingDelayed:
-    """Stands for the updater of delayed networks where there are none."""
-
-    def step(self) -> None:
-        """After an update."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Nothing."""
-        return {}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """From nothing."""

@@ -140,7 +140,7 @@ def main(config: DictConfig) -> None:
                     descend(loss, optimizer, kept=None if is_policy_due else actor)
                     progress.losses |= scalars(losses)  # the policy's stay from when it was due
                     progress.updates += 1
-                    if is_policy_due:
+                    if updater is not None and is_policy_due:
                         updater.step()
                 temperatures.step(new)
                 collector.update_policy_weights_()

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from crossq import NothingDelayed, make_renormalised_critic
+from crossq import make_renormalised_critic
 from omegaconf import DictConfig, OmegaConf
 from score_sac import ScoreSACLoss
 from tensordict import TensorDict, TensorDictBase
@@ -236,15 +236,15 @@ def make_temperatures(config: DictConfig, loss_module: LossModule) -> Temperatur
     return TemperatureScheduler(loss_module, **schedules)
 
 
-def make_updater(config: DictConfig, loss_module: LossModule) -> TargetNetUpdater | NothingDelayed:
-    """Polyak averages; the reference policy of our losses is a copy instead."""
+def make_updater(config: DictConfig, loss_module: LossModule) -> TargetNetUpdater | None:
+    """Polyak averages; the reference policy of our losses is a copy instead. CrossQ has neither."""
     delayed = [
         name.removeprefix("target_").removesuffix("_params")
         for name, _ in loss_module.named_children()
         if name.startswith("target_")
     ]
     if not delayed:
-        return NothingDelayed()
+        return None
     updaters: list[TargetNetUpdater] = []
     if config.loss.get("reference_interval", 1) > 1:
         delayed.remove("actor_network")

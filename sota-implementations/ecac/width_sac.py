@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives import SACLoss
 
-from torchrl_ecpo.checks import as_fraction
+from torchrl_ecpo.checks import as_float
 from torchrl_ecpo.objectives.actions import gaussian_parameters
 
 
@@ -31,7 +31,7 @@ class WidthSACLoss(SACLoss):
 
     def __init__(self, *networks: Any, width_entropy: float = 1.0, **options: Any) -> None:
         super().__init__(*networks, **options)
-        self.width_entropy = as_fraction("width_entropy", width_entropy)
+        self.width_entropy = as_float("width_entropy", width_entropy, "[0, 1]")
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss of the policy, and the log-probabilities by which alpha is learned."""

@@ -311,9 +311,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         parser.error(str(error))
     if options.dry_run:
+        status = 0
         for run in runs:
-            print(f"{'done' if run.is_done else 'to do'}  {run}  {run.directory}")
-        return 0
+            try:
+                word = "done" if run.is_done else "to do"
+            except Exception as error:  # whatever a torn file raises, as in the queue
+                word, status = f"failed ({error})", 1
+            print(f"{word}  {run}  {run.directory}")
+        return status
     queue = Queue(runs, options.workers)
     processes = f"{queue.total} runs in {len(runs)} processes, {options.workers} at a time"
     print(f"{processes}, in {options.runs.resolve()}", flush=True)

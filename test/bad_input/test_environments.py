@@ -217,7 +217,7 @@ SUBJECTS = {
     "AlgorithmicEnv.step": Subject(
         play_task, {"action": torch.tensor([[[1, 1, 3], [0, 0, 0]], [[1, 1, 2], [0, 1, 4]]])}
     ),
-    "AlgorithmicEnv.load_state_dict": Subject(
+    "AlgorithmicEnv.load_state_dict": lambda: Subject(
         resume(make_task),
         make_task().state_dict(),
         fine={("_extra_state", "{}"): OLD},
@@ -250,12 +250,12 @@ SUBJECTS = {
         play_vectorised, {"action": torch.tensor([[[0.5], [-0.5]]])}, hands_on_nan=True
     ),
     "make_grouped_env().step, choices": Subject(play_cartpole, {"action": torch.tensor([[1, 0]])}),
-    "GroupedEnv.load_state_dict": Subject(
+    "GroupedEnv.load_state_dict": lambda: Subject(
         resume(make_group),
         {**make_group().get_extra_state(), "seed": 1},
         fine={("env", "missing"): OLD, ("seed", "0"): SEED},
     ),
-    "EpisodeReplay.load_state_dict": Subject(
+    "EpisodeReplay.load_state_dict": lambda: Subject(
         resume_replay,
         replayed(),
         fine={("env", "missing"): OLD, ("actions", "[]"): "an episode that begins"},
@@ -271,4 +271,5 @@ SUBJECTS = {
 
 @pytest.mark.parametrize("name", SUBJECTS)
 def test_environments(name):
-    check(f"`{name}`", SUBJECTS[name])
+    subject = SUBJECTS[name]
+    check(f"`{name}`", subject() if callable(subject) else subject)

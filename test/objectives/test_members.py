@@ -66,10 +66,8 @@ def test_defaults(loss_class, tau, tau_prime):
 
 # ------------------------------------------------------------------------------------- the scores
 
-every_score = pytest.mark.parametrize("score", ["return", "group", "batch"])
 
-
-@every_score
+@pytest.mark.parametrize("score", ["group", "batch"])
 @pytest.mark.parametrize(
     ("name", "delayed"), [*[(name, False) for name in CASES], *[(name, True) for name in DELAYED]]
 )

@@ -104,16 +104,14 @@ def test_trains_as_sac_does(dtype):
             optimizer.zero_grad()
             updater.step()
     tolerance = {"rtol": 1e-3, "atol": 1e-4} if dtype == torch.float32 else {}
-    start = make_networks(dtype=dtype)
-    for (name, mine), (_, other), old in zip(
-        ours.named_parameters(),
-        theirs.named_parameters(),
-        [*start.actor.parameters(), *ours.parameters()],
-        strict=False,
-    ):
-        assert_close(mine, other, **tolerance, msg=name)
-        if name.startswith("actor"):
-            assert (mine - old).abs().max() > 1e-2
+    parameters = dict(theirs.named_parameters())
+    assert dict(ours.named_parameters()).keys() == parameters.keys()
+    for name, mine in ours.named_parameters():
+        assert_close(mine, parameters[name], **tolerance, msg=name)
+    start = [*make_networks(dtype=dtype).actor.parameters()]
+    moved = [x for name, x in ours.named_parameters() if name.startswith("actor")]
+    for new, old in zip(moved, start, strict=True):
+        assert (new - old).abs().max() > 1e-2
     for name, buffer in ours.named_buffers():
         if name.startswith("target_"):
             assert_close(buffer, dict(theirs.named_buffers())[name], **tolerance, msg=name)

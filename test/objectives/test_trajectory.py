@@ -38,20 +38,25 @@ from trajectory_problems import (
 from torchrl_ecpo.schedules import TemperatureScheduler, theorem1_schedules
 from torchrl_ecpo.updaters import PeriodicCopy, PolyakAverage
 
-SHAPES = [(3, 4), (2, 2, 3, 4)]
 ECPO = CASES["ecpo"]  # of which is asked what stands once in the base class
+SHAPE = (2, 2, 3, 4)
 losses = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 delayable = pytest.mark.parametrize("case", [CASES[n] for n in DELAYED], ids=DELAYED)
 
 
-def with_actors(names):
+def with_actors(names, kinds=tuple(ACTORS)):
     """Each loss, and ECPO with every kind of actor, whose log-probabilities the base reads."""
     pairs = [(name, "categorical") for name in names]
-    pairs += [("ecpo", kind) for kind in ACTORS if kind != "categorical"]
+    pairs += [("ecpo", kind) for kind in kinds if kind != "categorical"]
     return pytest.mark.parametrize(("name", "kind"), pairs)
 
 
-padding = pytest.mark.parametrize("padded", [False, True], ids=["whole", "padded"])
+def with_padding(names):
+    """The same with padded steps, and a few without."""
+    (pairs,) = with_actors(names).args[1:]
+    whole = [("ecpo", kind) for kind in ("categorical", "composite", "lstm")]
+    each = [*((*pair, True) for pair in pairs), *((*pair, False) for pair in whole)]
+    return pytest.mark.parametrize(("name", "kind", "padded"), each)
 
 
 def assert_same(loss, actor, batch, expected: Tensor, **tolerance):
@@ -69,20 +74,23 @@ def assert_same(loss, actor, batch, expected: Tensor, **tolerance):
 # ------------------------------------------------------------------------------ value and gradient
 
 
-@with_actors(CASES)
-@padding
+@with_padding(CASES)
 def test_formula(name, kind, padded):
     """Any actor, any lengths, NaN and infinity in every padded step: the formula, unpadded."""
     loss, actor, batch = problem(CASES[name], kind, padded=padded)
     assert_same(loss, actor, batch, expected_losses(CASES[name], actor, batch))
 
 
-@losses
-@pytest.mark.parametrize("shape", SHAPES, ids=str)
-@pytest.mark.parametrize("masked", [(), (1, 5)], ids=["all", "some-left-out"])
-def test_group_shapes_and_missing_trajectories(case, shape, masked):
+@pytest.mark.parametrize(
+    ("name", "shape", "masked"),
+    [
+        *((name, SHAPE, (1, 5)) for name in CASES),
+        *(("ecpo", *each) for each in ((SHAPE, ()), ((3, 4), (1, 5)), ((3, 4), ()))),
+    ],
+)
+def test_group_shapes_and_missing_trajectories(name, shape, masked):
     """A trajectory without a real step is left out of its group, at any place of the batch."""
-    actor = make_actor()
+    case, actor = CASES[name], make_actor()
     masked = tuple(n for n in masked if n < torch.Size(shape[:-1]).numel())
     batch = pad(sample(actor, *shape), masked=masked)
     move(actor)
@@ -137,7 +145,7 @@ def test_half_precision(case, autocast):
     assert_close(out["loss_actor"], loss.surrogate(groups).loss.mean())  # without autocast
 
 
-@padding
+@pytest.mark.parametrize("padded", [False, True], ids=["whole", "padded"])
 def test_integer_rewards(padded):
     """Everything is reckoned in the dtype of the log-probabilities."""
     loss, _, batch = problem(ECPO, padded=padded)
@@ -216,8 +224,7 @@ def test_no_mask_key():
 # --------------------------------------------------------------------------------------- reference
 
 
-@with_actors(DELAYED)
-@padding
+@with_padding(DELAYED)
 def test_delayed_reference_and_older_data(name, kind, padded):
     """With delay_actor the target is the reference, corrected for the policy that drew the data."""
     case = CASES[name]
@@ -402,11 +409,10 @@ def _expected_diagnostics(n: Numbers, weights: Tensor) -> dict[str, Tensor]:
     }
 
 
-@losses
-@pytest.mark.parametrize("masked", [(), (1, 5)], ids=["all", "some-left-out"])
-def test_diagnostics(case, masked):
+@pytest.mark.parametrize(("name", "masked"), [("ecpo", ()), *((name, (1, 5)) for name in CASES)])
+def test_diagnostics(name, masked):
     """Each diagnostic is its formula, group by group; reduced, the mean over groups."""
-    actor = make_actor()
+    case, actor = CASES[name], make_actor()
     batch = sample(actor, 3, 3, 4)
     batch["next", "reward"][1] = 0.5  # constant by step, and by trajectory if of equal length
     batch = pad(batch, masked=masked)
@@ -444,14 +450,13 @@ def test_equal_returns_and_no_entropy_term():
 # --------------------------------------------------------------------------------------- reduction
 
 
-@losses
-@pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_reduction(case, shape):
+@pytest.mark.parametrize(("name", "shape"), [("ecpo", (3, 4)), *((name, SHAPE) for name in CASES)])
+def test_reduction(name, shape):
     """None is the mean over groups; "none" has a number for each; only the loss has a gradient.
 
     A trainer that sums everything named loss and backpropagates finds only the loss.
     """
-    actor = make_actor()
+    case, actor = CASES[name], make_actor()
     batch = sample(actor, *shape)
     batch["next", "reward"].requires_grad_()
     outs = {r: case.build(actor, reduction=r)(batch) for r in (None, "none", "mean", "sum")}
@@ -499,12 +504,11 @@ def test_lists_of_keys():
     assert_close(loss(batch), expected)
 
 
-@losses
+@with_actors(CASES, kinds=("tanh_normal", "composite", "lstm"))
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-@pytest.mark.parametrize("kind", ["categorical", "tanh_normal", "composite", "lstm"])
-def test_gpu(case, kind):
+def test_gpu(name, kind):
     """The same numbers on a GPU, with the loss moved there after it was built."""
-    loss, _, batch = problem(case, kind)
+    loss, _, batch = problem(CASES[name], kind)
     expected = loss(batch)
     got = loss.to("cuda")(batch.to("cuda"))
     assert got.device is None or got.device.type == "cuda"

@@ -365,8 +365,6 @@ def scores(n: Numbers, score: str) -> Tensor:
 
 def scored(groups: list[Numbers], score: str) -> list[Numbers]:
     """The groups of a batch, with scores for returns."""
-    if score == "return":
-        return groups
     distances = [n.returns - n.returns.mean() for n in groups]
     within = [torch.cat(distances)] * len(groups) if score == "batch" else distances
     return [

@@ -21,8 +21,6 @@ from torchrl_ecpo.collectors._base import PlayerCollector, check_makers
 from torchrl_ecpo.collectors.rollout import GroupPlayer
 from torchrl_ecpo.collectors.workers import Workers
 
-__all__ = ["TrajectoryGroupCollector"]
-
 # Arguments of TorchRL's collectors that group collection leaves no room for, and why.
 _REFUSED = {
     "frames_per_batch": "a batch is counted in groups: num_groups and group_size",

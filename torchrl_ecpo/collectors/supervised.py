@@ -15,8 +15,6 @@ from torchrl_ecpo.checks import check_count, check_kind
 from torchrl_ecpo.collectors._base import PlayerCollector, check_makers
 from torchrl_ecpo.collectors.workers import Workers, set_training
 
-__all__ = ["SupervisedAsyncCollector", "SupervisedSyncCollector", "shut_down"]
-
 
 class _FramePlayer(Collector):
     """TorchRL's collector, called as the players are."""

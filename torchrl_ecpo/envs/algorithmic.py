@@ -19,8 +19,6 @@ from torchrl.envs import EnvBase
 from torchrl_ecpo.checks import check_choice, check_count, check_kind, described, get_entry
 from torchrl_ecpo.envs._groups import GroupIdAllocator, check_owner
 
-__all__ = ["TASKS", "AlgorithmicEnv", "AlgorithmicTask"]
-
 # gym's curriculum ends at min_length 30, and a length is min_length plus 0, 1 or 2.
 _TOP_LEVEL = 30
 _LENGTH_SPREAD = 3

@@ -10,8 +10,6 @@ from torchrl.data import Unbounded
 from torchrl_ecpo.checks import as_float, check_count, check_kind, described, get_choice
 from torchrl_ecpo.envs._groups import OneInstance
 
-__all__ = ["BanditEnv"]
-
 
 class BanditEnv(OneInstance):
     """A bandit with many actions, few good ones, and a feature vector for each action.
@@ -64,8 +62,7 @@ class BanditEnv(OneInstance):
         num_actions = check_count("num_actions", num_actions)
         num_features = check_count("num_features", num_features)
         instance_seed = check_count("instance_seed", instance_seed, least=0)
-        if not 0 <= as_float("exponent", exponent) < float("inf"):
-            raise ValueError(f"exponent must be a finite number >= 0, got {exponent!r}.")
+        exponent = as_float("exponent", exponent, "[0, inf)")
         super().__init__(num_groups, group_size, device)
         generator = torch.Generator().manual_seed(instance_seed)
         rewards = torch.rand(num_actions, generator=generator).pow(exponent)

@@ -10,8 +10,6 @@ from torchrl.data import Categorical
 from torchrl_ecpo.checks import check_count, get_choice
 from torchrl_ecpo.envs._groups import OneInstance
 
-__all__ = ["DeepSeaEnv"]
-
 
 class DeepSeaEnv(OneInstance):
     r"""A diver in a square of `size` x `size` cells, one row lower after each step.

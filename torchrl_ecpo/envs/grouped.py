@@ -14,8 +14,6 @@ from torchrl.envs import EnvBase, GymWrapper, ParallelEnv, SerialEnv, Transforme
 from torchrl_ecpo.checks import check_count, check_flag, check_group_size, check_real, get_entry
 from torchrl_ecpo.envs._groups import SeededGroups
 
-__all__ = ["GroupedEnv"]
-
 
 class GroupedEnv(SeededGroups):
     """`G` rows of `K` copies of an environment; the copies of a row start from the same state.

@@ -14,8 +14,6 @@ from gymnasium import spaces, wrappers
 
 from torchrl_ecpo.checks import check_kind
 
-__all__ = ["readable"]
-
 SINGLE_SPACES = (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)
 
 

@@ -13,8 +13,6 @@ from torchrl.envs import DMControlWrapper, GymWrapper, Transform
 from torchrl_ecpo.checks import check_flag, check_kind
 from torchrl_ecpo.envs._groups import check_owner, describe
 
-__all__ = ["EpisodeReplay"]
-
 
 class EpisodeReplay(Transform):
     """Makes the state of a gymnasium or dm_control task part of the environment's state dict.
@@ -52,11 +50,6 @@ class EpisodeReplay(Transform):
     def _reset_env_preprocess(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._start, self._actions = self._random_state(), []
         return tensordict
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return tensordict_reset
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"]

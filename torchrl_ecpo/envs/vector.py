@@ -30,8 +30,6 @@ from torchrl_ecpo.envs._groups import SeededGroups
 from torchrl_ecpo.envs.grouped import GroupedEnv
 from torchrl_ecpo.groups import GROUP_KEY
 
-__all__ = ["VectorGroupedEnv", "make_grouped_env"]
-
 
 def make_grouped_env(
     env: str | Callable[[], gym.Env | EnvBase],

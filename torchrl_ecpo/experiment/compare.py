@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 from omegaconf import OmegaConf
 
-from torchrl_ecpo.checks import as_float
 from torchrl_ecpo.experiment.figures import plot_comparison, smooth
 from torchrl_ecpo.experiment.run import METRICS_FILE, read_metrics
 
@@ -140,7 +139,6 @@ def load_comparison(
         KeyError: if a run has no such metric or entry.
         ValueError: if a run has no value yet, or the runs of a method do not overlap.
     """
-    smoothing = as_float("smoothing", smoothing)
     if metric is None:
         measured = read_metrics(runs[0])
         metric = next((name for name in DEFAULT_METRICS if name in measured), DEFAULT_METRICS[-1])

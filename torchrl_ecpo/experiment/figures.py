@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 
-from torchrl_ecpo.checks import as_fraction
+from torchrl_ecpo.checks import as_float
 
 __all__ = [
     "COLOURS",
@@ -93,7 +93,7 @@ def smooth(values: np.ndarray, fraction: float = 0.02) -> np.ndarray:
         >>> smooth(np.array([0.0, 2.0, 4.0, 6.0]), fraction=0.5).tolist()
         [0.0, 1.0, 3.0, 5.0]
     """
-    fraction = as_fraction("fraction, of the smoothing,", fraction)
+    fraction = as_float("fraction, of the smoothing,", fraction, "[0, 1]")
     window = max(int(len(values) * fraction), 1)
     if window == 1:
         return values

@@ -75,36 +75,37 @@ class MetricsTable:
         self.path = path
         self.rows: list[dict[str, float]] = []
         self._columns: list[str] = []
-        self._sha256 = hashlib.sha256()
         self._written: tuple[int, ...] | None = None
 
     def log_metrics(self, metrics: Mapping[str, float], step: int) -> None:
         """Append a row. A new column rewrites the file, with empty cells in earlier rows.
 
         Raises:
-            ValueError: if the step is not beyond that of the row before, or anything no number.
+            ValueError: if the step is not beyond that of the row before, if a metric is called
+                step, or if anything is no number.
         """
         if not math.isfinite(as_float("step", step)):
             raise ValueError(f"step must be finite, got {step}.")
         if self.rows and not step > self.rows[-1]["step"]:
             raise ValueError(f"step must grow, got {step} after {self.rows[-1]['step']}.")
         self.restore()
+        if "step" in metrics:
+            raise ValueError("A metric cannot be called step, as the first column is: rename it.")
         row = {"step": step, **{name: as_float(name, value) for name, value in metrics.items()}}
         self.rows.append(row)
         if any(name not in self._columns for name in row):
             self._columns = _columns(self.rows)
-            self._rewrite(_table(self._columns, self.rows))
+            self._rewrite()
             return
         text = _table(self._columns, [row], with_header=False)
         with self.path.open("a", newline="") as file:
             file.write(text)
-        self._sha256.update(text.encode())
         self._written = self._stat()
 
     def restore(self) -> None:
         """Write all rows anew, and say so, if another program has changed or removed the file."""
         if self._written not in (None, self._stat()):
-            self._rewrite(_table(self._columns, self.rows))
+            self._rewrite()
             print(
                 f"{self.path} was changed or removed by another program: it is written anew, with "
                 "all rows of this run.",
@@ -117,15 +118,14 @@ class MetricsTable:
             stat = self.path.stat()
             return stat.st_ino, stat.st_size, stat.st_mtime_ns
 
-    def _rewrite(self, text: str) -> None:
-        _write(self.path, text)
-        self._sha256 = hashlib.sha256(text.encode())
+    def _rewrite(self) -> None:
+        _write(self.path, _table(self._columns, self.rows))
         self._written = self._stat()
 
     @property
     def sha256(self) -> str:
         """Hash of the table."""
-        return self._sha256.hexdigest()
+        return _sha256(self._columns, self.rows)
 
     def cut_back(self, step: int, sha256: str | None = None) -> None:
         """Continue the file as it was at a step: later rows and half a row are dropped.
@@ -150,19 +150,22 @@ class MetricsTable:
                     break
                 rows.append(row)
         columns = _columns(rows)
-        text = _table(columns, rows)
-        is_other = sha256 not in (None, hashlib.sha256(text.encode()).hexdigest())
+        is_other = sha256 not in (None, _sha256(columns, rows))
         if is_other or step != (rows[-1]["step"] if rows else 0):
             raise ValueError(
                 f"{self.path} does not reach to step {step}, where the run goes on, with the rows "
                 "that were logged: put back those that are missing or were changed."
             )
         self.rows, self._columns = rows, columns
-        self._rewrite(text)
+        self._rewrite()
 
 
 def _columns(rows: Sequence[Mapping[str, float]]) -> list[str]:
     return list(dict.fromkeys(name for row in rows for name in row))
+
+
+def _sha256(columns: Sequence[str], rows: Sequence[Mapping[str, float]]) -> str:
+    return hashlib.sha256(_table(columns, rows).encode()).hexdigest()
 
 
 def _table(

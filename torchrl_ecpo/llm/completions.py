@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -24,8 +24,6 @@ from torchrl_ecpo.checks import (
     values_can_be_seen,
 )
 
-__all__ = ["check_sampler", "record_log_probs"]
-
 # What leaves the policy's own distribution as it is, by name of the sampler's setting.
 NEUTRAL: Mapping[str, tuple[float | None, ...]] = {
     "temperature": (None, 1),
@@ -34,19 +32,6 @@ NEUTRAL: Mapping[str, tuple[float | None, ...]] = {
     "min_p": (None, 0),
     "repetition_penalty": (None, 1),
 }
-
-
-class Completions(NamedTuple):
-    """Groups of completions: numbers are ``[*G, K, L]``, 0 where the mask is False."""
-
-    rewards: Tensor
-    """The return of a completion, at its last token."""
-    log_prob: Tensor
-    """log pi_theta of each token of a completion; carries the gradient."""
-    recorded: Tensor | None
-    """The recorded log-probabilities, if there are any."""
-    mask: Tensor
-    """True where the token is the policy's own."""
 
 
 def is_language_model(actor: Any) -> bool:
@@ -224,17 +209,22 @@ def read_completions(
     reward_key: NestedKey,
     prompt_key: NestedKey,
     mask_key: NestedKey | None,
-) -> Completions:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Read completions as groups.
 
     Args:
         actor: a wrapper with ``generate=False``.
         tensordict: completions ``[B]``, groups of which `prompt_key` tells, or groups ``[*G, K]``.
         tokens_key: prompt and completion.
-        log_prob_key: their recorded log-probabilities, if there are any.
+        log_prob_key: their recorded log-probabilities.
         reward_key: of a completion, or of its tokens, which are added up.
         prompt_key: text, integer or tokens, equal within a group only.
         mask_key: which tokens are the policy's own. ``"auto"``: those after the prompt; None: all.
+
+    Returns:
+        Of each token ``[*G, K, L]``: rewards, the return of a completion being at its last token;
+        log pi_theta, which carries the gradient; the recorded log-probability; and the mask of the
+        policy's own tokens, outside of which numbers are 0.
     """
     _check_dropout(actor)
     rows, members = tensordict.reshape(-1), _members(tensordict, prompt_key)
@@ -251,13 +241,16 @@ def read_completions(
         mask = attention & check_mask(mask_key, _padded(rows, mask_key, False), attention.shape)
     mask = _with_context(mask, attention)
     log_prob = _log_prob(logits, tokens, mask)
-    recorded = None
-    if _entries(rows, log_prob_key) is not None:
-        recorded = _recorded(_padded(rows, log_prob_key, 0.0), log_prob_key, log_prob, mask)
-        recorded = recorded[members]
+    if _entries(rows, log_prob_key) is None:
+        raise KeyError(
+            f"The entry {log_prob_key!r} is missing: the log-probability of each token under the "
+            "policy that drew it. Compute it with torchrl_ecpo.llm.record_log_probs(actor, batch), "
+            "before the first update."
+        )
+    recorded = _recorded(_padded(rows, log_prob_key, 0.0), log_prob_key, log_prob, mask)
     last = mask & (mask.flip(-1).cumsum(-1).flip(-1) == 1)
     rewards = returns.to(log_prob.dtype).unsqueeze(-1).where(last, 0.0)
-    return Completions(rewards[members], log_prob[members], recorded, mask[members])
+    return rewards[members], log_prob[members], recorded[members], mask[members]
 
 
 # ------------------------------------------------------------------------------------- small parts

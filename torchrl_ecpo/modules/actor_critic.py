@@ -41,16 +41,6 @@ from torchrl_ecpo.checks import (
 )
 from torchrl_ecpo.modules.pixels import PixelEncoder
 
-__all__ = [
-    "DenseNetwork",
-    "make_action_value_network",
-    "make_categorical_actor",
-    "make_deterministic_actor",
-    "make_qvalue_network",
-    "make_tanh_gaussian_actor",
-    "make_value_network",
-]
-
 HIDDEN_SIZES = (256, 256)
 LOG_SCALE_BOUNDS = (-5.0, 2.0)
 """Of the Gaussian before tanh: 2 is SAC's, its -20 is never reached; e^-5 acts like no scale."""
@@ -99,8 +89,6 @@ class DenseNetwork(TensorDictModuleBase):
         layer_norm: bool = False,
     ) -> None:
         super().__init__()
-        if not 0 <= as_float("final_gain", final_gain) < math.inf:
-            raise ValueError(f"final_gain must be at least 0 and finite, got {final_gain}.")
         self.in_keys, self.out_keys = (
             check_keys("in_keys", in_keys),
             check_keys("out_keys", out_keys),
@@ -111,7 +99,7 @@ class DenseNetwork(TensorDictModuleBase):
         if head is not None:
             check_kind("head", head, Callable)
         self.head = head
-        self.final_gain = final_gain
+        self.final_gain = as_float("final_gain", final_gain, "[0, inf)")
         self.layer_norm = check_flag("layer_norm", layer_norm)
         self._names = [name for i in range(len(sizes) - 1) for name in (f"weight_{i}", f"bias_{i}")]
         for weight, bias, fan_in, fan_out in self._layers():

@@ -18,8 +18,6 @@ from torch.distributions.transforms import ComposeTransform, TanhTransform
 
 from torchrl_ecpo.checks import check_kind
 
-__all__ = ["record_latents"]
-
 LOST = 1e-4
 """An error of the latent, by the rounding of the action, that counts."""
 

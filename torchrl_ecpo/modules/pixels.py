@@ -10,8 +10,6 @@ from torchrl.modules import ConvNet
 
 from torchrl_ecpo.checks import check_counts
 
-__all__ = ["PixelEncoder"]
-
 CHANNELS = (16, 32, 32, 32)
 """Of convolutions each of which halves height and width."""
 

@@ -21,8 +21,6 @@ from torchrl_ecpo.modules.histories import (
     hash_states,
 )
 
-__all__ = ["DistinctHistoryLSTM"]
-
 STATE_KEYS = ("recurrent_state_h", "recurrent_state_c")  # each `[*B, 1, H]`, as with LSTMModule
 
 

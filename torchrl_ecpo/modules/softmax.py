@@ -10,8 +10,6 @@ from torchrl.modules import ProbabilisticActor
 
 from torchrl_ecpo.checks import check_kind, described
 
-__all__ = ["LinearSoftmax", "SharedCategorical", "make_softmax_policy"]
-
 
 class LinearSoftmax(nn.Module):
     r"""Logits :math:`\phi^\top \theta` of actions with feature vectors :math:`\phi`.

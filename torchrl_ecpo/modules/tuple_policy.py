@@ -21,8 +21,6 @@ from torchrl_ecpo.modules.distinct import Evaluated, take_rows
 from torchrl_ecpo.modules.recurrent import DistinctHistoryLSTM
 from torchrl_ecpo.modules.windows import DistinctWindowNetwork, OneHotLinear
 
-__all__ = ["TupleCategorical", "TupleTables", "make_tuple_policy"]
-
 
 def _num_logits(nvec: Sequence[int]) -> int:
     try:

@@ -15,8 +15,6 @@ from torchrl.data import TensorSpec, Unbounded
 from torchrl_ecpo.checks import check_count, check_counts, check_kind, described
 from torchrl_ecpo.modules.distinct import DistinctCore, Evaluated, radix
 
-__all__ = ["DistinctWindowNetwork", "OneHotLinear"]
-
 STATE_KEY = "window"
 FEW = 1024
 """So many windows are evaluated one and all."""

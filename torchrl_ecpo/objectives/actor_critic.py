@@ -28,7 +28,6 @@ from torchrl.objectives.value.advantages import ValueEstimatorBase
 from torchrl_ecpo.checks import (
     UNREADABLE,
     as_float,
-    as_fraction,
     check_choice,
     check_count,
     check_flag,
@@ -52,8 +51,6 @@ from torchrl_ecpo.objectives.actions import (
     check_policy,
     is_discrete,
 )
-
-__all__ = ["ActorCriticLoss", "Lift", "States"]
 
 LOSS_FUNCTIONS = ("l2", "l1", "smooth_l1")
 SATURATED = 0.95
@@ -536,11 +533,11 @@ class ActorCriticLoss(PolicyLoss):
     def _next_state_value(self, tensordict: TensorDictBase, ended: Tensor) -> Tensor:
         """V(s') ``[*B]`` of the delayed value network, or from delayed Q and the reference."""
         # Distributions refuse NaN, also where nothing comes of it.
-        blank = _blank if self.skip_done_states else _blank_unless_finite
         observations: Any = tensordict.select(*self._next_observations)
         # With a batch size also a lazy stack is taken as a whole, as `ended` is.
         observations = observations.apply(
-            lambda x: blank(x, ended), batch_size=observations.batch_size
+            lambda x: _blank(x, ended, only_strange=not self.skip_done_states),
+            batch_size=observations.batch_size,
         )
         if self.value_network is not None:
             return self._state_value(observations, self.target_value_network_params)
@@ -665,7 +662,7 @@ class ActorCriticLoss(PolicyLoss):
         """
         for name in ("gamma", "lmbda"):
             if name in hyperparams:
-                hyperparams[name] = as_fraction(name, hyperparams[name])
+                hyperparams[name] = as_float(name, hyperparams[name], "[0, 1]")
         value_type = self.default_value_estimator if value_type is None else value_type
         if isinstance(value_type, (ValueEstimators, str)):
             supported = self.SUPPORTED_VALUE_ESTIMATORS
@@ -689,10 +686,6 @@ class ActorCriticLoss(PolicyLoss):
             super().make_value_estimator(value_type, **hyperparams)  # pyright: ignore
         self._forward_value_estimator_keys()
         return self
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        keys, names = self.tensor_keys, ("value", "reward", "done", "terminated")
-        self.value_estimator.set_keys(**{name: getattr(keys, name) for name in names})
 
     # ---------------------------------------------------------------------------------- reporting
 
@@ -885,18 +878,11 @@ def _saturation(action: Tensor, policy: Distribution) -> Tensor:
     return (position.abs() > SATURATED).to(action.dtype).mean((0, -1))
 
 
-def _blank(entry: Tensor, where: Tensor) -> Tensor:
-    """0 in these places, and True in a mask, as that of the actions that may be taken."""
+def _blank(entry: Tensor, where: Tensor, *, only_strange: bool = False) -> Tensor:
+    """0 in these places, and True in a mask of actions; or only what is NaN or infinite there."""
     where = where.reshape(*where.shape, *(1,) * (entry.ndim - where.ndim))
+    where = where & ~entry.isfinite() if only_strange else where
     return entry.masked_fill(where, entry.dtype == torch.bool)
-
-
-def _blank_unless_finite(entry: Tensor, where: Tensor) -> Tensor:
-    """0 in these places if it is NaN or infinite."""
-    if not entry.is_floating_point():
-        return entry
-    where = where.reshape(*where.shape, *(1,) * (entry.ndim - where.ndim))
-    return entry.masked_fill(where & ~entry.isfinite(), 0)
 
 
 def _written(outputs: TensorDictBase, name: str, key: NestedKey, network: Any) -> Tensor:

@@ -10,7 +10,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
 from torch.distributions import Distribution
 
-from torchrl_ecpo.checks import as_fraction, as_share, check_choice, check_count
+from torchrl_ecpo.checks import as_float, check_choice, check_count
 from torchrl_ecpo.functional import (
     Surrogate,
     centred_gaussian_projection,
@@ -20,8 +20,6 @@ from torchrl_ecpo.functional import (
 )
 from torchrl_ecpo.objectives.actions import PairedActions, SampledActions, gaussian_parameters
 from torchrl_ecpo.objectives.actor_critic import ActorCriticLoss, Lift, States
-
-__all__ = ["DiscreteECACLoss", "ECACLoss"]
 
 PROJECTIONS = ("centred", "paper", "gradient")
 NO_SLOPE = (
@@ -163,7 +161,7 @@ class ECACLoss(ActorCriticLoss):
     ) -> None:
         check_choice("projection", projection, PROJECTIONS)
         is_paired = projection == "gradient"
-        width_entropy = as_fraction("width_entropy", width_entropy)
+        width_entropy = as_float("width_entropy", width_entropy, "[0, 1]")
         if width_entropy != 1 and not is_paired:
             raise ValueError(
                 'width_entropy is an option of projection="gradient", which has the entropy of '
@@ -319,4 +317,6 @@ class DiscreteECACLoss(ECACLoss):
             projection=projection,
             **options,
         )
-        self.target_entropy_weight = as_share("target_entropy_weight", target_entropy_weight)
+        self.target_entropy_weight = as_float(
+            "target_entropy_weight", target_entropy_weight, "(0, 1)"
+        )

@@ -16,8 +16,6 @@ from torchrl_ecpo.functional import (
 )
 from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, Score, TrajectoryGroups
 
-__all__ = ["ECPOLoss"]
-
 
 class ECPOLoss(LiftProjectLoss):
     r"""ECPO: lift with an entropy term, project by the mean-seeking KL(target, pi).

@@ -20,8 +20,6 @@ from torchrl_ecpo.functional import (
 )
 from torchrl_ecpo.objectives.trajectory import Score, TrajectoryGroupLoss, TrajectoryGroups
 
-__all__ = ["GRPOLoss"]
-
 
 class GRPOLoss(TrajectoryGroupLoss):
     r"""GRPO: clipped ratios of the steps, weighed by the scores of their trajectories.

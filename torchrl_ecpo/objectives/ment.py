@@ -10,8 +10,6 @@ from torch import Tensor
 from torchrl_ecpo.functional import Surrogate, ment_surrogate
 from torchrl_ecpo.objectives.trajectory import Score, TrajectoryGroupLoss, TrajectoryGroups
 
-__all__ = ["MENTLoss"]
-
 
 class MENTLoss(TrajectoryGroupLoss):
     r"""MENT: REINFORCE with an entropy bonus and the group's mean as baseline.

@@ -14,8 +14,6 @@ from torchrl_ecpo.functional import Surrogate, mean_seeking_projection
 from torchrl_ecpo.objectives.actions import SampledActions, gaussian_parameters
 from torchrl_ecpo.objectives.actor_critic import ActorCriticLoss, States
 
-__all__ = ["MPOLoss"]
-
 
 class MPOLoss(ActorCriticLoss):
     r"""MPO: ECAC's lift with bounded divergences instead of temperatures.

@@ -5,8 +5,6 @@ from __future__ import annotations
 from torchrl_ecpo.functional import Surrogate, mode_seeking_projection
 from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, TrajectoryGroups
 
-__all__ = ["PMDLoss"]
-
 
 class PMDLoss(LiftProjectLoss):
     r"""PMD: lift, and project by the mode-seeking KL(pi, target).

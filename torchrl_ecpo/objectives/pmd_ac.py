@@ -6,12 +6,10 @@ from typing import Any, Literal
 
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 
-from torchrl_ecpo.checks import as_share
+from torchrl_ecpo.checks import as_float
 from torchrl_ecpo.functional import Surrogate
 from torchrl_ecpo.objectives.actions import AllActions, actions_of
 from torchrl_ecpo.objectives.actor_critic import ActorCriticLoss, States
-
-__all__ = ["DiscretePMDACLoss", "PMDACLoss"]
 
 
 class PMDACLoss(ActorCriticLoss):
@@ -151,4 +149,6 @@ class DiscretePMDACLoss(PMDACLoss):
             target_entropy=target_entropy,
             **options,
         )
-        self.target_entropy_weight = as_share("target_entropy_weight", target_entropy_weight)
+        self.target_entropy_weight = as_float(
+            "target_entropy_weight", target_entropy_weight, "(0, 1)"
+        )

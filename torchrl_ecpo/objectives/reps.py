@@ -12,8 +12,6 @@ from torchrl_ecpo.functional import Surrogate, lift_divergence_estimate, self_no
 from torchrl_ecpo.objectives.ecpo import ECPOLoss
 from torchrl_ecpo.objectives.trajectory import Score, TrajectoryGroups
 
-__all__ = ["REPSLoss"]
-
 
 class REPSLoss(ECPOLoss):
     r"""REPS: ECPO with a bound on the lift instead of a temperature.

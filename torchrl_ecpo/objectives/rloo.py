@@ -15,8 +15,6 @@ from torchrl_ecpo.functional import (
 from torchrl_ecpo.objectives.ment import MENTLoss
 from torchrl_ecpo.objectives.trajectory import Score, TrajectoryGroups
 
-__all__ = ["RLOOLoss"]
-
 
 class RLOOLoss(MENTLoss):
     r"""RLOO: REINFORCE with the mean of the other trajectories of the group as baseline.

@@ -10,8 +10,6 @@ from torchrl_ecpo.checks import check_choice
 from torchrl_ecpo.functional import Surrogate, squared_residual_projection
 from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, Score, TrajectoryGroups
 
-__all__ = ["SquaredPMDLoss"]
-
 
 class SquaredPMDLoss(LiftProjectLoss):
     r"""Squared PMD: lift, and project by regression of log pi on the log of the target.

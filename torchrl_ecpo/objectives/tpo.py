@@ -11,8 +11,6 @@ from torchrl_ecpo.checks import check_flag
 from torchrl_ecpo.functional import Surrogate, group_cross_entropy
 from torchrl_ecpo.objectives.trajectory import Score, TrajectoryGroupLoss, TrajectoryGroups
 
-__all__ = ["TPOLoss"]
-
 
 class TPOLoss(TrajectoryGroupLoss):
     r"""TPO: lift within the group, project by the cross-entropy of the group's softmaxes.

@@ -55,8 +55,6 @@ from torchrl_ecpo.modules.latents import (
 )
 from torchrl_ecpo.objectives._base import PolicyLoss, Reduction
 
-__all__ = ["LiftProjectLoss", "Steps", "TrajectoryGroupLoss", "TrajectoryGroups"]
-
 SCORES = {
     "return": lambda returns, mask: returns,
     "group": standardised,
@@ -309,7 +307,7 @@ class TrajectoryGroupLoss(PolicyLoss):
         if found.weights is not None:  # how evenly a lift weighs the trajectories
             ess, largest = effective_sample_size(found.weights), found.weights.amax(-1)
             of_weights = {"ESS": ess, "max_weight": largest}
-            metrics |= {name: of_weights[name] for name in OF_WEIGHTS if name in self.metrics}
+            metrics |= {name: x for name, x in of_weights.items() if name in self.metrics}
         self._check_declared(found.losses, metrics)
         metrics |= _of_groups(groups)
         reduction = Reduction(self.reduction, found.loss.shape)
@@ -383,7 +381,7 @@ class TrajectoryGroupLoss(PolicyLoss):
 
     def _read_completions(self, tensordict: TensorDictBase) -> Steps:
         keys: Any = self.tensor_keys
-        found = read_completions(
+        rewards, log_prob, recorded, mask = read_completions(
             self.actor_network,
             tensordict,
             tokens_key=keys.action,
@@ -392,15 +390,9 @@ class TrajectoryGroupLoss(PolicyLoss):
             prompt_key=keys.prompt,
             mask_key=self.loss_mask_key,
         )
-        if found.recorded is None:
-            raise KeyError(
-                f"The entry {keys.sample_log_prob!r} is missing: the log-probability of each token "
-                "under the policy that drew it. Compute it with torchrl_ecpo.llm.record_log_probs("
-                "actor, batch), before the first update."
-            )
         if values_can_be_seen():
-            self._check_left(self.loss_mask_key, found.mask)
-        return Steps(found.rewards, found.log_prob, found.recorded, found.recorded, found.mask)
+            self._check_left(self.loss_mask_key, mask)
+        return Steps(rewards, log_prob, recorded, recorded, mask)
 
     def _read_steps(self, tensordict: TensorDictBase) -> Steps:
         if self._reads_completions:

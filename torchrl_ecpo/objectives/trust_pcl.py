@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrl_ecpo.checks import (
     UNREADABLE,
-    as_fraction,
+    as_float,
     check_count,
     check_network,
     get_entry,
@@ -21,8 +21,6 @@ from torchrl_ecpo.checks import (
 from torchrl_ecpo.functional import Surrogate, masked_mean, path_consistency
 from torchrl_ecpo.llm.completions import is_language_model
 from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, Steps, TrajectoryGroups
-
-__all__ = ["TrustPCLLoss"]
 
 
 class TrustPCLLoss(LiftProjectLoss):
@@ -132,7 +130,7 @@ class TrustPCLLoss(LiftProjectLoss):
             reduction=reduction,
         )
         check_network("value_network", value_network)
-        self.gamma = as_fraction("gamma", gamma)
+        self.gamma = as_float("gamma", gamma, "[0, 1]")
         self.n_steps = check_count("n_steps", n_steps)
         self.convert_to_functional(value_network, "value_network")
         self.further_in_keys = tuple(value_network.in_keys)

@@ -10,8 +10,6 @@ from torch import Tensor
 from torchrl_ecpo.functional import Surrogate, urex_surrogate
 from torchrl_ecpo.objectives.trajectory import Score, TrajectoryGroupLoss, TrajectoryGroups
 
-__all__ = ["UREXLoss"]
-
 
 class UREXLoss(TrajectoryGroupLoss):
     r"""UREX: policy gradient plus tau times a mean-seeking projection.
