@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from copy import deepcopy
+from typing import Any
 
 import pytest
 import torch
@@ -41,7 +42,8 @@ that are vectors and numbers. DiscretePMDACLoss is given one-hot actions."""
 
 def spoilt_options(name):
     """Those of the loss's own constructor; the base's, which it hands on, are spoilt of ECAC."""
-    names = {*inspect.signature(CASES[name].loss.__init__).parameters}
+    own: Any = CASES[name].loss.__init__
+    names = {*inspect.signature(own.__wrapped__).parameters}
     if name == "ecac":
         names |= {*inspect.signature(ActorCriticLoss.__init__).parameters, "gamma"}
     return {key: x for key, x in OPTIONS.items() if key in names and x is not None}

@@ -348,12 +348,12 @@ def test_exploration_type():
 @every_loss
 def test_constructor(case):
     """Networks by position, everything else by keyword; what the class says is what it has."""
-    parameters = inspect.signature(case.loss).parameters
-    assert list(parameters)[:3] == ["actor_network", "qvalue_network", "value_network"]
-    of_base = list(inspect.signature(ActorCriticLoss).parameters.values())[3:]
-    assert all(p.kind is p.KEYWORD_ONLY for p in of_base)
+    _, *parameters = inspect.signature(case.loss.__init__).parameters.values()
+    names = [p.name for p in parameters]
+    assert names[:3] == ["actor_network", "qvalue_network", "value_network"]
+    assert {*inspect.signature(ActorCriticLoss.__init__).parameters} <= {"self", *names}
+    assert all(p.kind is p.KEYWORD_ONLY for p in parameters[3:])
     doc = inspect.getdoc(ECACLoss) or ""
-    names = {*parameters, *(p.name for p in of_base)} - {"options"}
     assert [n for n in names if f"{n}:" not in doc + (inspect.getdoc(case.loss) or "")] == []
     assert issubclass(case.loss, LossModule)
     projection = () if issubclass(case.loss, ECACLoss) else ("projection",)

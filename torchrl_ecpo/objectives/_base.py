@@ -58,7 +58,9 @@ class PolicyLoss(LossModule):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        signature = _whole_signature(cls.__init__, super(cls, cls).__init__)
         cls.__init__ = _names_its_class(cls.__init__)
+        vars(cls.__init__)["__signature__"] = signature  # what help() shows
 
     def __init__(
         self,
@@ -324,19 +326,19 @@ class PolicyLoss(LossModule):
 
 
 def options_of(kind: type[PolicyLoss]) -> dict[str, Any]:
-    """The arguments of a loss and their defaults: a class hands ``**options`` to its parent."""
-    options: dict[str, Any] = {}
-    for parent in kind.__mro__:
-        if "__init__" in vars(parent):
-            _, *parameters = inspect.signature(parent.__init__).parameters.values()
-            packed = [
-                one for one in parameters if one.kind in (one.VAR_POSITIONAL, one.VAR_KEYWORD)
-            ]
-            own = {one.name: one.default for one in parameters if one not in packed}
-            options = {**own, **options}
-            if not packed:
-                break
-    return options
+    """The arguments of a loss and their defaults."""
+    _, *parameters = inspect.signature(kind.__init__).parameters.values()
+    return {parameter.name: parameter.default for parameter in parameters}
+
+
+def _whole_signature(init: Any, parent: Any) -> inspect.Signature:
+    """With what a constructor hands on to its parent's as ``**options``."""
+    own = dict(inspect.signature(init).parameters)
+    last = own.popitem()[1]
+    if last.kind is not last.VAR_KEYWORD:
+        return inspect.signature(init)
+    handed_on = inspect.signature(parent).parameters
+    return inspect.Signature([*own.values(), *(handed_on[n] for n in handed_on if n not in own)])
 
 
 def _names_its_class(init: Callable[..., None]) -> Callable[..., None]:
