@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import math
 import re
 from pathlib import Path
@@ -292,8 +293,13 @@ def test_a_member_may_read_what_its_signature_does_not_name():
     assert_close(loss.temperature("tau").item(), 2.0)
     with pytest.raises(TypeError, match="actor_network must have a get_dist method"):
         Renaming(torch.nn.Linear(1, 1), networks.qvalues, temperature=2.0)
-    with pytest.raises(TypeError, match=r"^Renaming has no option .*'tua'; it has actor_network"):
+    with pytest.raises(
+        TypeError, match=r"^Renaming has no option .*'tua'; it has actor, qvalue, proj"
+    ):
         Renaming(networks.actor, networks.qvalues, temperature=2.0, tua=1)
+    names = [*inspect.signature(Renaming.__init__).parameters]
+    assert names[:4] == ["self", "actor", "qvalue", "projection"]
+    assert {"tau", "reduction"} < {*names}
 
 
 class Seeing(TrajectoryGroupLoss):

@@ -332,13 +332,18 @@ def options_of(kind: type[PolicyLoss]) -> dict[str, Any]:
 
 
 def _whole_signature(init: Any, parent: Any) -> inspect.Signature:
-    """With what a constructor hands on to its parent's as ``**options``."""
-    own = dict(inspect.signature(init).parameters)
-    last = own.popitem()[1]
-    if last.kind is not last.VAR_KEYWORD:
-        return inspect.signature(init)
-    handed_on = inspect.signature(parent).parameters
-    return inspect.Signature([*own.values(), *(handed_on[n] for n in handed_on if n not in own)])
+    """With what a constructor hands on to its parent's, as ``*args`` and ``**options``."""
+    own = inspect.signature(init).parameters.values()
+    packed = {one.kind for one in own} & {
+        inspect.Parameter.VAR_POSITIONAL,
+        inspect.Parameter.VAR_KEYWORD,
+    }
+    named = {one.name: one for one in own if one.kind not in packed}
+    for one in inspect.signature(parent).parameters.values() if packed else ():
+        if one.kind is one.KEYWORD_ONLY or one.VAR_POSITIONAL in packed:
+            named.setdefault(one.name, one)
+    order = sorted(named.values(), key=lambda one: (one.kind, one.default is not one.empty))
+    return inspect.Signature(order)
 
 
 def _names_its_class(init: Callable[..., None]) -> Callable[..., None]:
