@@ -45,7 +45,7 @@ from torchrl_ecpo.collectors import (
     TrajectoryGroupCollector,
     shut_down,
 )
-from torchrl_ecpo.collectors.workers import Workers
+from torchrl_ecpo.collectors.workers import Workers, _serve
 from torchrl_ecpo.envs import GroupedEnv
 from torchrl_ecpo.envs._groups import GroupIdAllocator
 from torchrl_ecpo.groups import TrajectoryGroupSampler, pack_groups, unpack_groups
@@ -115,6 +115,10 @@ class Moded(nn.Linear):
 
 def moded_policy():
     return TensorDictModule(Moded(2, 1, bias=False), ["observation"], ["action", "training"])
+
+
+def lazy_policy():
+    return TensorDictModule(nn.LazyLinear(1), ["observation"], ["action"])
 
 
 def recurrent_policy():
@@ -576,13 +580,41 @@ class Stranger(Countdown):
         ),
         ({"num_collectors": 1, "create_env_fn": Countdown()}, TypeError, "got an EnvBase"),
         ({"policy_factory": linear_policy}, TypeError, "does not take policy_factory"),
-        ({"nonsense": 1}, TypeError, "nonsense"),
+        ({"nonsense": 1}, TypeError, "has no option nonsense; .* it has compact_obs, exclude_keys"),
+        ({"policy": lazy_policy()}, ValueError, "lazy layers, whose weights do not exist yet"),
     ],
 )
 def test_bad_arguments(options, error, match):
     options = {"create_env_fn": Countdown, "num_groups": 2, "group_size": 3, **options}
     with pytest.raises(error, match=match):
-        TrajectoryGroupCollector(policy=linear_policy(), **options)
+        TrajectoryGroupCollector(**{"policy": linear_policy(), **options})
+
+
+def test_what_a_policy_may_not_return():
+    with pytest.raises(TypeError, match=r"must return the TensorDict .* with the entries \['actio"):
+        collect(Countdown(), lambda tensordict: tensordict["observation"][..., :1])
+
+
+def test_what_a_policy_foresees_is_not_what_it_is_shown():
+    """The environment's own next observation counts, as in TorchRL's collector."""
+    seen = []
+
+    def foresee(observation):
+        seen.append(observation.clone())
+        return observation[..., :1], torch.full_like(observation, 7.0)
+
+    keys = ["action", ("next", "observation")]
+    batch = collect(Countdown(shortest=3), TensorDictModule(foresee, ["observation"], keys))
+    assert batch["observation"].shape[-1] == 2
+    assert not any((each == 7).any() for each in seen)
+
+
+def test_a_collector_that_was_shut_down_collects_no_more():
+    collector = TrajectoryGroupCollector(Countdown(), num_groups=2, group_size=3)
+    next(iter(collector))
+    collector.shutdown()
+    with pytest.raises(RuntimeError, match="was shut down: make another"):
+        next(iter(collector))
 
 
 @pytest.mark.parametrize(
@@ -677,6 +709,22 @@ def test_what_is_loaded_leaves_out_what_was_under_way():
 
 
 @pytest.mark.usefixtures("forked_workers")
+class Unlicensed(Exception):
+    def __init__(self, what, code):
+        super().__init__(f"{what}: {code}")
+
+
+def test_an_error_of_a_worker_that_cannot_travel_is_told():
+    """It would count as the death of the worker, and its own words be lost."""
+
+    def make():
+        raise Unlicensed("no licence", 3)
+
+    request = cloudpickle.dumps(({}, "start", make, 0))
+    with pytest.raises(RuntimeError, match=r"Unlicensed: no licence: 3\nTraceback"):
+        _serve(request)
+
+
 def test_workers_that_play_frames_number_their_own_trajectories():
     collector = SupervisedSyncCollector([partial(GymEnv, "Pendulum-v1")] * 2, frames_per_batch=8)
     with shut_down(collector):

@@ -9,9 +9,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from processes import FORKED
-from tensordict import NonTensorData, NonTensorStack, TensorDict, assert_close
+from tensordict import (
+    LazyStackedTensorDict,
+    NonTensorData,
+    NonTensorStack,
+    TensorDict,
+    assert_close,
+)
 from torchrl.data import (
     LazyMemmapStorage,
+    LazyStackStorage,
     LazyTensorStorage,
     ListStorage,
     ReplayBuffer,
@@ -115,6 +122,10 @@ class TestPack:
 
     def test_padded_rows_and_groups(self):
         groups = pack_groups(make_steps(TRAJECTORIES, is_init=True))
+        lazy = LazyStackedTensorDict(*groups.unbind(0))
+        assert_close(unpack_groups(lazy), unpack_groups(groups), rtol=0, atol=0)
+        lazy = LazyStackedTensorDict(*groups.reshape(6, 4).unbind(0))
+        assert_close(pack_groups(lazy), groups, rtol=0, atol=0)
         rows = groups.reshape(6, 4)[torch.tensor([0, 2, 1, 4, 3, 5])]
         assert_close(pack_groups(rows), groups, rtol=0, atol=0)
         assert pack_groups(groups, group_size=2) is groups
@@ -492,12 +503,13 @@ class TestSampler:
             ({"group_key": "instance"}, KeyError, "'instance' is missing.*problem instance"),
             ({"done_key": ("next", "end")}, KeyError, "end.*where a trajectory ends"),
             ({"storage": ListStorage}, TypeError, "LazyTensorStorage.*got ListStorage"),
+            ({"storage": LazyStackStorage}, TypeError, "LazyTensorStorage.*got LazyStackStorage"),
             ({"storage": lambda n: LazyTensorStorage(n, ndim=2)}, ValueError, "needs flat steps"),
         ],
     )
     def test_bad_options(self, options, error, match):
         steps = make_steps(TRAJECTORIES)
-        flat = options.get("storage") in (None, ListStorage)
+        flat = options.get("storage") in (None, ListStorage, LazyStackStorage)
 
         def use():
             buffer = make_buffer(**options)
@@ -506,6 +518,18 @@ class TestSampler:
 
         with pytest.raises(error, match=match):
             use()
+
+    def test_one_storage_for_each_sampler(self):
+        """Where the trajectories of one end would pass for ends in the other."""
+        buffer = make_buffer(batch_size=2)
+        buffer.extend(make_steps(TRAJECTORIES))
+        other = TensorDictReplayBuffer(storage=LazyTensorStorage(9), sampler=buffer.sampler)
+        with pytest.raises(ValueError, match="serves one storage, and this one has another"):
+            other.extend(make_steps(TRAJECTORIES[:1]))
+        assert buffer.sample()["group"].shape[:2] == (1, 2)
+        copied = pickle.loads(pickle.dumps(buffer.sampler))  # which has none yet
+        fresh = TensorDictReplayBuffer(storage=LazyTensorStorage(20), sampler=copied)
+        fresh.extend(make_steps(TRAJECTORIES))
 
     def test_writers_that_go_round_alone(self):
         buffer = TensorDictReplayBuffer(

@@ -1,6 +1,10 @@
-"""Private names of TorchRL and tensordict, each with the reason why no public one will do."""
+"""Private names of TorchRL and tensordict, and a defect, each with the reason for it."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -54,6 +58,23 @@ def generator_of(sampler: Sampler) -> torch.Generator | None:
     The buffer hands it to its sampler under this name alone.
     """
     return sampler._rng
+
+
+@contextmanager
+def holding(network: Any, params: Any) -> Iterator[None]:
+    """Let a network have these parameters, and its own again afterwards.
+
+    That is ``params.to_module``, which gives back nothing where an error leaves its block: the
+    user's network would keep delayed parameters, and no optimiser would reach it any more.
+    """
+    error = None
+    with params.to_module(network, preserve_module_state=False):
+        try:
+            yield
+        except Exception as caught:
+            error = caught
+    if error is not None:
+        raise error
 
 
 def carrier_of(collector: Collector) -> TensorDictBase:

@@ -7,14 +7,22 @@ Shapes: `G` groups (problem instances), `K` trajectories of each, `T` steps of t
 from __future__ import annotations
 
 import json
+import weakref
 from collections import deque
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase, is_leaf_nontensor, is_non_tensor
+from tensordict import (
+    LazyStackedTensorDict,
+    NestedKey,
+    TensorDict,
+    TensorDictBase,
+    is_leaf_nontensor,
+    is_non_tensor,
+)
 from torch import Tensor
-from torchrl.data.replay_buffers import RoundRobinWriter, Storage
+from torchrl.data.replay_buffers import ListStorage, RoundRobinWriter, Storage
 from torchrl.data.replay_buffers.samplers import Sampler
 
 from torchrl_ecpo._torchrl import buffers_of, generator_of
@@ -164,6 +172,8 @@ def unpack_groups(data: TensorDictBase, *, mask_key: NestedKey = MASK_KEY) -> Te
     if mask is None:
         return data.reshape(-1)
     real = check_mask(mask_key, mask, data.shape).reshape(-1).nonzero().squeeze(-1)
+    if isinstance(data, LazyStackedTensorDict):
+        data = data.contiguous()
     # A copy of the structure, from which empty entries go: what is nested in it is the caller's.
     return data.exclude(mask_key).copy().filter_empty_().reshape(-1)[real]
 
@@ -428,6 +438,7 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
         self._drawn: list[int] = []  # the groups of this pass
         # After how many steps written the newest trajectory had ended, for the oldest step's sake.
         self._ends, self._seen = deque([0]), 0
+        self._storage: Any = None  # a reference to the one that `_ends` is about
         self._state: Any = None  # of the storage, when this was found in it:
         self._whole: Any = None
 
@@ -436,6 +447,7 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
         """Look at the steps at `index` again: the writer calls this, you after an edit in place."""
         assert storage is not None, "the buffer passes its storage"
+        self._attach(storage)
         size, self._state = storage.max_size, None
         index = torch.as_tensor(index).reshape(-1)[-size:].cpu()
         done = self._read(storage, index)["done"]
@@ -446,6 +458,16 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
                 self._seen = written
                 while self._ends and self._ends[0] < written - size:
                     self._ends.popleft()
+
+    def _attach(self, storage: Storage) -> None:
+        """Refuse a second storage: the ends of one say nothing of the other."""
+        known = None if self._storage is None else self._storage()
+        if known not in (None, storage):
+            raise ValueError(
+                f"A {type(self).__name__} serves one storage, and this one has another: make one "
+                "for each buffer."
+            )
+        self._storage = weakref.ref(storage)
 
     def _writers(self, storage: Storage) -> list[tuple[int, int, bool]]:
         """Return of each that has written: the next slot, the number of steps, whether ours."""
@@ -462,7 +484,7 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
 
     def _read(self, storage: Storage, index: Tensor | slice) -> TensorDictBase:
         data = storage[:]
-        if not isinstance(data, TensorDictBase):
+        if isinstance(storage, ListStorage) or not isinstance(data, TensorDictBase):
             raise TypeError(
                 f"{type(self).__name__} needs a storage that holds a tensordict, such as "
                 f"LazyTensorStorage or LazyMemmapStorage, got {type(storage).__name__}."
@@ -487,6 +509,7 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
         return _read_steps(data, self.group_key, self.traj_key, self.done_key)
 
     def _find(self, storage: Storage) -> _Whole:
+        self._attach(storage)
         filled, writers = len(storage), self._writers(storage)  # pyright: ignore[reportArgumentType]
         state = (storage, filled, writers)
         if state != self._state:
@@ -637,7 +660,7 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave behind what the storage tells: a copy looks at its own."""
-        return {**super().__getstate__(), "_state": None, "_whole": None}
+        return {**super().__getstate__(), "_storage": None, "_state": None, "_whole": None}
 
 
 def _in_pieces(steps: TensorDictBase, start: Tensor, cut: Tensor) -> bool:

@@ -10,6 +10,8 @@ from torch import Tensor
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives import SACLoss
 
+from torchrl_ecpo._torchrl import holding
+
 
 class ScoreSACLoss(SACLoss):
     r"""TorchRL's ``SACLoss`` with a V network, but for how the policy follows Q.
@@ -31,7 +33,7 @@ class ScoreSACLoss(SACLoss):
         state = tensordict.select(*self.actor_network.in_keys)
         with (
             set_exploration_type(ExplorationType.RANDOM),
-            self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
+            holding(self.actor_network, self.actor_network_params),
         ):
             distribution: Any = self.actor_network.get_dist(state)
             action, log_prob = distribution.sample_and_log_prob()
@@ -39,7 +41,7 @@ class ScoreSACLoss(SACLoss):
             state.set(self.tensor_keys.action, action)
             qvalues = critic.each(state, self.qvalue_network_params)
             qvalue = qvalues.get(self.tensor_keys.state_action_value).min(0)[0].squeeze(-1)
-            with value_params.to_module(value_network, preserve_module_state=False):
+            with holding(value_network, value_params):
                 value = value_network(state).get(self.tensor_keys.value).squeeze(-1)
             signal = log_alpha.exp() * log_prob - qvalue + value
         return (log_prob * signal).mean(), {"log_prob": log_prob.detach()}

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives import SACLoss
 
+from torchrl_ecpo._torchrl import holding
 from torchrl_ecpo.checks import as_float
 from torchrl_ecpo.objectives.actions import gaussian_parameters
 
@@ -41,7 +42,7 @@ class WidthSACLoss(SACLoss):
         log_alpha: Any = self.log_alpha
         with (
             set_exploration_type(ExplorationType.RANDOM),
-            self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
+            holding(self.actor_network, self.actor_network_params),
         ):
             _, scale = gaussian_parameters(self.actor_network.get_dist(tensordict))
         width = scale.log().sum(-1).mean()

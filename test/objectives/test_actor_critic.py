@@ -362,6 +362,23 @@ def test_constructor(case):
             case.build(**{name: 0.9})
 
 
+@every_loss
+def test_an_error_leaves_the_networks_as_they_were(case):
+    """tensordict's ``to_module`` would leave delayed parameters in them, which nobody trains."""
+    networks = make_networks(case.kind)
+    loss = case.build(networks, value=True)
+    modules = [networks.actor, networks.value]
+    before = [[*map(id, module.parameters())] for module in modules]
+    held = dict(loss.qvalue_network.named_parameters())
+    batch = make_batch(case.kind)
+    for key in ("observation", ("next", "observation")):
+        with pytest.raises((ValueError, RuntimeError)):
+            call(loss, batch.clone().set(key, batch[key][..., :1]))
+    assert [[*map(id, module.parameters())] for module in modules] == before
+    assert dict(loss.qvalue_network.named_parameters()).keys() == held.keys()
+    deepcopy(loss)
+
+
 DEFAULTS = {
     "reduction": "mean",
     "loss_function": "l2",

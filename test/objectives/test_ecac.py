@@ -375,6 +375,12 @@ def test_options_of_the_gradient(options, message):
         CASE.build(**PAIRED | options)
 
 
+def test_the_gradient_of_q_is_not_for_inference_mode():
+    loss = CASE.build(**PAIRED)
+    with torch.inference_mode(), pytest.raises(ValueError, match=r"torch.no_grad\(\)"):
+        call(loss, make_batch())
+
+
 def test_what_has_no_gradient():
     """A policy that is no Gaussian, and a critic that is not differentiable in the action."""
     networks = make_networks()

@@ -235,6 +235,16 @@ def test_delayed_reference_and_older_data(name, kind, padded):
 
 
 @delayable
+def test_an_error_leaves_the_actor_as_it_was(case):
+    """tensordict's ``to_module`` would leave the delayed parameters in it, which nobody trains."""
+    loss, actor, batch = problem(case, padded=False, delay_actor=True)
+    before = [*map(id, actor.parameters())]
+    with pytest.raises(ValueError, match="cannot be evaluated on"):
+        loss(batch.set("observation", batch["observation"][..., :1]))
+    assert [*map(id, actor.parameters())] == before
+
+
+@delayable
 def test_delayed_reference_without_recorded_log_prob(case):
     """Nothing recorded: the data is taken to be the reference's, that is, the target's."""
     loss, actor, batch = problem(case, padded=False, delay_actor=True)

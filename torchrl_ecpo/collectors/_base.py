@@ -76,8 +76,11 @@ class PlayerCollector(BaseCollector):
 
         Raises:
             ChildProcessError: if a worker has died.
+            RuntimeError: after :meth:`shutdown`.
         """
         while self._frames < self.total_frames:
+            if self.closed:
+                raise RuntimeError("The collector was shut down: make another one.")
             self._iter += 1
             if self.pre_collect_hook is not None:
                 self.pre_collect_hook()

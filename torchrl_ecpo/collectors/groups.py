@@ -6,6 +6,7 @@ batch size `[*B, K]` with `prod(B)` groups.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from functools import partial
@@ -13,6 +14,7 @@ from typing import Any
 
 from tensordict import TensorDict, TensorDictBase, pad
 from torch import nn
+from torch.nn.parameter import is_lazy
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
@@ -41,6 +43,7 @@ _REFUSED = {
     "max_frames_per_traj": "append StepCounter(max_steps=...) to the environment",
     "weight_sync_schemes": "workers are sent the weights with their next batch",
 }
+_OF_PLAYERS = [*inspect.signature(GroupPlayer).parameters][4:]
 
 
 class TrajectoryGroupCollector(PlayerCollector):
@@ -138,6 +141,11 @@ class TrajectoryGroupCollector(PlayerCollector):
         """Make the collector; the class describes the arguments."""
         for name in options.keys() & _REFUSED.keys():
             raise TypeError(f"TrajectoryGroupCollector does not take {name}: {_REFUSED[name]}.")
+        if unknown := options.keys() - {*_OF_PLAYERS}:
+            raise TypeError(
+                f"TrajectoryGroupCollector has no option {', '.join(sorted(unknown))}; beside its "
+                f"own it has {', '.join(_OF_PLAYERS)}."
+            )
         num_groups = check_count("num_groups", num_groups)
         group_size = check_group_size(group_size)
         check_flag("sync", sync, None)
@@ -152,6 +160,7 @@ class TrajectoryGroupCollector(PlayerCollector):
                 f"num_groups={num_groups} must be a multiple of the number of workers, "
                 f"{len(makers)}."
             )
+        _check_policy(policy)
         super().__init__(policy, total_frames, postproc, replay_buffer)
         self.num_groups, self.group_size = num_groups, group_size
         self.requested_frames_per_batch = num_groups * group_size  # at least
@@ -176,6 +185,15 @@ class TrajectoryGroupCollector(PlayerCollector):
         parts = [pad(batch, own) for batch, own in zip(played, padding, strict=True)]
         groups: Any = TensorDict.cat(parts)
         return groups
+
+
+def _check_policy(policy: Any) -> None:
+    """Refuse a policy whose copy would draw other weights."""
+    if isinstance(policy, nn.Module) and any(map(is_lazy, policy.parameters())):
+        raise ValueError(
+            "The policy has lazy layers, whose weights do not exist yet: the collector's copy "
+            "would draw others. Call it once before, policy(env.reset())."
+        )
 
 
 def _find_makers(

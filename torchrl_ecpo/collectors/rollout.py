@@ -27,7 +27,7 @@ from torchrl.modules import (
     set_exploration_modules_spec_from_env,
 )
 
-from torchrl_ecpo.checks import check_count, check_flag, check_keys, check_kind
+from torchrl_ecpo.checks import check_count, check_flag, check_keys, check_kind, described
 from torchrl_ecpo.collectors.workers import set_training
 from torchrl_ecpo.groups import GROUP_KEY, MASK_KEY, TRAJECTORY_KEY
 from torchrl_ecpo.modules import record_latents
@@ -229,7 +229,13 @@ class GroupPlayer:
         return self.policy(seen.to(self.policy_device)).to(rows.device)
 
     def _check_actions(self, acted: TensorDictBase) -> None:
-        """Refuse an index where the environment reads one-hot, which it would take for another."""
+        """Refuse what is no action, and an index where the environment reads one-hot."""
+        if not isinstance(acted, TensorDictBase):
+            raise TypeError(
+                "The policy must return the TensorDict that it is given, with the entries "
+                f"{self.env.action_keys}, got {described(acted)}. Wrap a network that returns a "
+                "tensor: TensorDictModule(network, in_keys=[...], out_keys=[...])."
+            )
         for key, spec in self.env.full_action_spec.items(True, True):
             action = acted.get(key, None)
             if action is not None and action.shape != spec.shape:
@@ -267,10 +273,13 @@ class GroupPlayer:
         given = {key for key in every if key[0] != "next"}
         result = {unravel_key(key[1:]) for key in every - given}
         written = set(acted.keys(True, True))
-        carried = {unravel_key(key[1:]): key for key in written if key[0] == "next"}
+        handed = {key for key in written if key[0] == "next"}
+        # What the environment observes counts, as in TorchRL's collector; primers only pass on.
+        observed = set(self._levels()[0].full_observation_spec.keys(True, True))
+        carried = {own: key for key in handed if (own := unravel_key(key[1:])) not in observed}
         dropped = self.exclude_keys | carried.keys()
         named = map(unravel_key, getattr(self.policy, "out_keys", self.env.action_keys))
-        written -= set(carried.values()) | given.difference(named)
+        written -= handed | given.difference(named)
         read = given | written
         if self._read is not None:
             read = {key for key in read if _is_below(key, self._read)}

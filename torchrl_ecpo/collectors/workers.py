@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -227,7 +229,15 @@ _host = _Host()  # of a worker process
 
 
 def _serve(request: bytes) -> bytes:
-    return cloudpickle.dumps(_host.call(*cloudpickle.loads(request)))
+    try:
+        return cloudpickle.dumps(_host.call(*cloudpickle.loads(request)))
+    except Exception as error:
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:  # it could not travel, and would count as the death of the worker
+            lines = traceback.format_exc()
+            raise RuntimeError(f"{type(error).__name__}: {error}\n{lines}") from None
+        raise
 
 
 def _begin_process() -> None:

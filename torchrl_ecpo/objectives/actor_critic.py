@@ -25,6 +25,7 @@ from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
 from torchrl.objectives.value import TD0Estimator, TD1Estimator, TDLambdaEstimator
 from torchrl.objectives.value.advantages import ValueEstimatorBase
 
+from torchrl_ecpo._torchrl import holding
 from torchrl_ecpo.checks import (
     UNREADABLE,
     as_float,
@@ -482,7 +483,7 @@ class ActorCriticLoss(PolicyLoss):
         inputs = tensordict.select(*self.actor_network.in_keys)
         with (
             set_exploration_type(ExplorationType.RANDOM),
-            params.to_module(self.actor_network, preserve_module_state=False),
+            holding(self.actor_network, params),
         ):
             return self.actor_network.get_dist(inputs)
 
@@ -592,7 +593,7 @@ class ActorCriticLoss(PolicyLoss):
         else:
             outputs = []
             for each in params.unbind(0):
-                with each.to_module(network, preserve_module_state=False):
+                with holding(network, each):
                     outputs.append(_written(network(inputs.copy()), name, key, network))
             qvalues = torch.stack(outputs)
         if not self._reads_action:
@@ -609,7 +610,7 @@ class ActorCriticLoss(PolicyLoss):
         network = self.value_network
         assert network is not None
         observations = observations.select(*network.in_keys)
-        with params.to_module(network, preserve_module_state=False):
+        with holding(network, params):
             outputs = network(observations)
         return _written(outputs, "value", self.tensor_keys.value, network).squeeze(-1)
 

@@ -47,7 +47,8 @@ class ECACLoss(ActorCriticLoss):
             ``projection="centred"`` and ``"gradient"``, any with ``rsample`` for ``"paper"``.
             Actions are ``[*B, A]``.
         qvalue_network: reads observation and action, writes ``"state_action_value"`` ``[*B, 1]``;
-            differentiable in the action for ``"gradient"``. A list gives the networks one by one.
+            differentiable in the action for ``"gradient"``. Each of `num_qvalue_nets` is a copy of
+            it with weights drawn anew; a list gives the networks one by one, as they are.
         value_network: reads the observation, writes ``"state_value"`` ``[*B, 1]``. With it, the
             value of the next state is that of its delayed copy (the paper, Eq. 9); without
             (default), it is computed from delayed Q and the reference policy (Eq. 8), which learned
@@ -206,6 +207,11 @@ class ECACLoss(ActorCriticLoss):
             actions = PairedActions.of(reference, self.num_action_samples)
             if torch.compiler.is_compiling():  # a graph has no place for autograd, which is faster
                 slope, score = torch.func.grad(height, has_aux=True)(actions.latent)
+            elif torch.is_inference_mode_enabled():
+                raise ValueError(
+                    'projection="gradient" differentiates Q, which torch.inference_mode() forbids: '
+                    "call the loss in torch.no_grad()."
+                )
             else:
                 with torch.enable_grad():
                     latent = actions.latent.requires_grad_()

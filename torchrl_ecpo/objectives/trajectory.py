@@ -21,6 +21,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.distributions import Categorical
 
+from torchrl_ecpo._torchrl import holding
 from torchrl_ecpo.checks import (
     UNREADABLE,
     check_choice,
@@ -482,7 +483,7 @@ class TrajectoryGroupLoss(PolicyLoss):
         inputs = inputs.copy()  # the actor writes its intermediate results into its input
         action_keys = _as_list(self.tensor_keys.action)
         steps = list(_steps_of(self.actor_network))
-        with params.to_module(self.actor_network, preserve_module_state=False):
+        with holding(self.actor_network, params):
             try:
                 if sum(isinstance(step, _Head) for step in steps) > 1:
                     return self._log_prob_of_parts(steps, inputs, action_keys).reshape(shape)

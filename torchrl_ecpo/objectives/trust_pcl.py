@@ -10,6 +10,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_ecpo._torchrl import holding
 from torchrl_ecpo.checks import (
     UNREADABLE,
     as_float,
@@ -166,7 +167,7 @@ class TrustPCLLoss(LiftProjectLoss):
         """V ``[*G, K, T]`` of each step's state; carries the gradient."""
         assert steps.inputs is not None
         inputs, keys = steps.inputs.copy(), self.value_network.in_keys
-        with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
+        with holding(self.value_network, self.value_network_params):
             try:
                 outputs = self.value_network(inputs)
             except UNREADABLE as error:
