@@ -163,6 +163,17 @@ def needed(path: str, value: float | None = None) -> np.ndarray:
     return scores.steps_to_solve(*curve(path), value)
 
 
+def played(path: str) -> np.ndarray:
+    """The steps of the environment that each run needs to solve its task, ``[runs]``.
+
+    Infinite if it never does.
+    """
+    episodes, lengths = curve(path, "length")
+    steps = (np.diff(episodes, prepend=0) * lengths).cumsum(-1)
+    ends = needed(path)[:, None]
+    return np.where(np.isfinite(ends[:, 0]), (steps * (episodes == ends)).sum(-1), np.inf)
+
+
 def finite(values: np.ndarray) -> np.ndarray:
     """The finite ones."""
     return values[np.isfinite(values)]
