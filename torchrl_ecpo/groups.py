@@ -462,11 +462,15 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
     def _attach(self, storage: Storage) -> None:
         """Refuse a second storage: the ends of one say nothing of the other."""
         known = None if self._storage is None else self._storage()
-        if known not in (None, storage):
+        if known is storage:
+            return
+        if known is not None:
             raise ValueError(
                 f"A {type(self).__name__} serves one storage, and this one has another: make one "
                 "for each buffer."
             )
+        if self._storage is not None:  # which is gone
+            self._empty()
         self._storage = weakref.ref(storage)
 
     def _writers(self, storage: Storage) -> list[tuple[int, int, bool]]:

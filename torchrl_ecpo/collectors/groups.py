@@ -43,6 +43,7 @@ _REFUSED = {
     "max_frames_per_traj": "append StepCounter(max_steps=...) to the environment",
     "weight_sync_schemes": "workers are sent the weights with their next batch",
 }
+# Options of the players, after what the collector itself is told.
 _OF_PLAYERS = [*inspect.signature(GroupPlayer).parameters][4:]
 
 
