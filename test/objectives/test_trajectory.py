@@ -35,6 +35,7 @@ from trajectory_problems import (
     split,
 )
 
+from torchrl_ecpo.objectives.trajectory import _sum_parts
 from torchrl_ecpo.schedules import TemperatureScheduler, theorem1_schedules
 from torchrl_ecpo.updaters import PeriodicCopy, PolyakAverage
 
@@ -249,6 +250,12 @@ def test_delayed_reference_without_recorded_log_prob(case):
     """Nothing recorded: the data is taken to be the reference's, that is, the target's."""
     loss, actor, batch = problem(case, padded=False, delay_actor=True)
     assert_close(loss(batch.exclude("action_log_prob")), case.build(actor)(batch))
+
+
+def test_nested_parts_of_an_action_are_summed():
+    parts = TensorDict({"move": torch.tensor([1.0]), "hand": {"grip": torch.tensor([2.0])}}, [1])
+    parts["hand", "force"] = torch.tensor([4.0])
+    assert _sum_parts(parts).tolist() == [7.0]
 
 
 @pytest.mark.parametrize("missing", [0, 1])
