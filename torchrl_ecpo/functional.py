@@ -1335,8 +1335,8 @@ def log_mean_exp(values: Tensor, *, sample_dim: int = -1, mask: Tensor | None = 
     Examples:
         log((1 + 3) / 2) = log 2:
 
-        >>> log_mean_exp(torch.tensor([1.0, 3.0]).log()).exp()
-        tensor(2.)
+        >>> round(log_mean_exp(torch.tensor([1.0, 3.0]).log()).exp().item(), 4)
+        2.0
     """
     _check_samples(sample_dim, mask, values=values)
     return _masked_logsumexp(values + _log_uniform(values, sample_dim, mask), sample_dim, mask)
