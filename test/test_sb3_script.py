@@ -57,3 +57,26 @@ def test_the_deep_sea_is_the_one_of_the_groups(beside):
             assert terminated == step["next", "terminated"].item()
             assert not truncated
     assert rollout["next", "reward"].max() > 0.9
+
+
+def test_an_lstm_that_reads_episodes_at_once_is_that_which_steps(beside):
+    ppo = beside("sb3", "ppo")
+    torch.manual_seed(0)
+    lstm = torch.nn.LSTM(3, 4)
+    features, states = torch.randn(5 * 6, 3), (torch.randn(1, 5, 4), torch.randn(1, 5, 4))
+    for late in (False, True):  # a second episode in a row, which sb3-contrib's buffer never has
+        starts = torch.zeros(5, 6)
+        starts[[0, 3], 0] = 1
+        starts[1, 2] = late
+        found, expected = (
+            policy._process_sequence(features, states, starts.flatten(), lstm)
+            for policy in (ppo.EpisodeLstmPolicy, ppo.RecurrentActorCriticPolicy)
+        )
+        torch.testing.assert_close(found, expected)
+        assert_same_gradients(lstm, found[0], expected[0])
+
+
+def assert_same_gradients(module, *outputs):
+    parameters = list(module.parameters())
+    found, expected = (torch.autograd.grad(each.sin().sum(), parameters) for each in outputs)
+    torch.testing.assert_close(found, expected)

@@ -23,10 +23,12 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 from sb3_contrib import RecurrentPPO
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from torch import Tensor, nn
 
 from torchrl_ecpo.envs import DeepSeaEnv, readable
 from torchrl_ecpo.experiment import Run, leaving_nothing
@@ -56,6 +58,27 @@ class DeepSea(gym.Env):
         column = min(max(column + (1 if is_right else -1), 0), self.size - 1)
         self.cell = min(self.size * (row + 1) + column, self.size**2)
         return self.cell, reward, self.cell == self.size**2, False, {}
+
+
+class EpisodeLstmPolicy(RecurrentActorCriticPolicy):
+    """sb3-contrib's, which steps through its LSTM wherever an episode begins: here in one call.
+
+    A sequence of its buffer begins with the episode, and holds no second one.
+    """
+
+    @staticmethod
+    def _process_sequence(
+        features: Tensor,
+        lstm_states: tuple[Tensor, Tensor],
+        episode_starts: Tensor,
+        lstm: nn.LSTM,
+    ) -> tuple[Tensor, Any]:
+        starts = episode_starts.reshape(lstm_states[0].shape[1], -1)
+        if not starts[:, 1:].any():
+            hidden, cell = ((1 - starts[:, 0]).view(1, -1, 1) * state for state in lstm_states)
+            lstm_states, episode_starts = (hidden, cell), torch.zeros_like(episode_starts)
+        own = RecurrentActorCriticPolicy
+        return own._process_sequence(features, lstm_states, episode_starts, lstm)
 
 
 class Record(BaseCallback):
@@ -108,7 +131,7 @@ def main(config: DictConfig) -> None:
     if config.normalize:
         envs = VecNormalize(envs, gamma=config.ppo.gamma)
     is_recurrent = config.get("recurrent", False)  # of env=popgym alone
-    method, policy = (RecurrentPPO, "MlpLstmPolicy") if is_recurrent else (PPO, "MlpPolicy")
+    method, policy = (RecurrentPPO, EpisodeLstmPolicy) if is_recurrent else (PPO, "MlpPolicy")
     model = method(policy, envs, seed=config.seed, device="cpu", **config.ppo)
     run = Run(
         config,
