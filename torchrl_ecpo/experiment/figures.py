@@ -68,7 +68,7 @@ METHOD_COLOURS = {
     **dict.fromkeys(("repsentropy", "lstm", "aselsewhereat1e3"), BROWN),
     **dict.fromkeys(("smallstartat3e4", "ofthegroup", "windowoffour"), BLUE),
     **dict.fromkeys(("ofthebatch", "memoryless"), GREEN),
-    **dict.fromkeys(("ppo", "crossq"), ORANGE),
+    **dict.fromkeys(("ppo", "recurrentppo", "crossq"), ORANGE),
     "tqc": RED,
     **dict.fromkeys(("sacphi04layernorm", "gradientsat3e4"), GREEN),
     **dict.fromkeys(("ecacphi04layernorm", "gradientsat1e3"), PURPLE),
