@@ -190,10 +190,21 @@ def test_episodes_and_groups_that_earn_as_much_are_counted(script):
     done = torch.tensor([False, True]).expand(3, 2, 2).clone()
     done[1, 1, 0] = True  # what is after the end earns nothing
     step = {"reward": reward.unsqueeze(-1), "done": done.unsqueeze(-1)}
-    groups = TensorDict({"next": step}, [3, 2, 2])
-    passes = script("tasks").passes(groups, solved=1)
-    assert passes["pass_at_1"] == pytest.approx(2 / 6)
-    assert passes["pass_at_k"] == pytest.approx(2 / 3)
+    action = torch.tensor([[[1, 1], [1, 1]], [[0, 1], [0, 0]], [[1, 1], [1, 1]]])
+    mask = ~done.roll(1, 2) | torch.tensor([True, False])
+    groups = TensorDict(
+        {"next": step, "action": action, "collector": {"mask": mask}, "other": {"action": action}},
+        [3, 2, 2],
+    )
+    passes = script("tasks").passes
+    expected = {"pass_at_1": pytest.approx(2 / 6), "pass_at_k": pytest.approx(2 / 3)}
+    assert passes(groups, solved=1) == {**expected, "distinct_solutions": pytest.approx(2 / 3)}
+    reward[1, 1, 0] = 1.0  # a second way in the group, and in the first one the same again
+    groups["next", "reward"][0] = 1.0
+    assert passes(groups, solved=1)["distinct_solutions"] == 1
+    groups["other", "action"] = torch.randn(3, 2, 2, 5)  # the same by one part of the action
+    keys = ["action", ("other", "action")]
+    assert passes(groups, solved=1, action_keys=keys)["distinct_solutions"] == pytest.approx(4 / 3)
 
 
 def test_metrics_of_a_batch_are_those_of_its_first_step_but_for_the_divergence(script):

@@ -257,7 +257,8 @@ def make_gym(config: DictConfig) -> Task:
     def measure(groups: TensorDictBase) -> Metrics:
         length = groups["collector", "mask"].sum(-1).float().mean()
         solved = config.env.solved
-        return {"length": length} | ({} if solved is None else passes(groups, solved))
+        passed = {} if solved is None else passes(groups, solved, env.action_keys)
+        return {"length": length} | passed
 
     def evaluate(groups: TensorDictBase) -> Metrics:
         return {"greedy_return": _returns(greedy(evaluation_env, actor)).mean()}
@@ -436,10 +437,20 @@ def greedy(env: EnvBase, actor: ProbabilisticTensorDictSequential) -> TensorDict
         )
 
 
-def passes(groups: TensorDictBase, solved: float) -> Metrics:
-    """Share of episodes, and of groups with one of them, that earn as much."""
+def passes(
+    groups: TensorDictBase, solved: float, action_keys: Sequence[Any] = ("action",)
+) -> Metrics:
+    """What groups attain, where an episode that earns so much is solved.
+
+    The share of these, that of groups with one, and how many different ones a group has.
+    """
     is_high = _returns(groups) >= solved
-    return {"pass_at_1": is_high.float().mean(), "pass_at_k": is_high.any(1).float().mean()}
+    actions = [groups[key].reshape(*groups.shape, -1) for key in action_keys]
+    return {
+        "pass_at_1": is_high.float().mean(),
+        "pass_at_k": is_high.any(1).float().mean(),
+        "distinct_solutions": distinct(is_high, torch.cat(actions, -1), groups),
+    }
 
 
 def distinct_solutions(groups: TensorDictBase) -> float:
@@ -448,14 +459,17 @@ def distinct_solutions(groups: TensorDictBase) -> float:
     Ways differ in moves, in when something is written, or in what; a character that is not written
     makes no difference.
     """
-    group_size = groups.shape[1]
-    solved = is_solved(groups).flatten()
-    action = groups["action"].flatten(0, 1)[solved]
+    action = groups["action"]
     is_written = torch.ones_like(action, dtype=torch.bool)
     is_written[..., 2] = action[..., 1] == 1
-    is_real = groups["collector", "mask"].flatten(0, 1)[solved].unsqueeze(-1)
-    ways = action.where(is_real & is_written, -1).flatten(1)
-    group = solved.nonzero() // group_size
+    return distinct(is_solved(groups), action.where(is_written, -1), groups)
+
+
+def distinct(solved: Tensor, action: Tensor, groups: TensorDictBase) -> float:
+    """Different action sequences ``[G, K, T, n]`` among the solved ``[G, K]``, a group."""
+    is_real = groups["collector", "mask"].unsqueeze(-1)
+    ways = action.where(is_real, -1)[solved].flatten(1)
+    group = solved.nonzero()[:, :1]
     return len(torch.cat([group, ways], 1).unique(dim=0)) / len(groups)
 
 
