@@ -37,6 +37,11 @@ def test_errors_without_a_message_have_a_name():
     assert str(error) == "The actor cannot be evaluated on 'action' (missing): NotImplementedError"
 
 
+def test_an_error_that_announces_another_one_is_told_with_it():
+    error = unreadable("actor", TensorDict(), ["action"], TypeError("Got this: \nno logits\nat x"))
+    assert str(error).endswith("(missing): Got this:  no logits")
+
+
 def test_flags_of_numpy():
     assert check_flag("f", np.bool_(False)) is False
     assert check_flag("f", "auto", "auto") == "auto"

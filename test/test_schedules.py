@@ -6,7 +6,7 @@ import pytest
 import torch
 from torchrl.objectives import LossModule
 
-from torchrl_ecpo import ECPOLoss
+from torchrl_ecpo import ECPOLoss, REPSLoss
 from torchrl_ecpo.functional import theorem1_temperatures
 from torchrl_ecpo.modules import make_softmax_policy
 from torchrl_ecpo.schedules import (
@@ -110,6 +110,26 @@ def test_schedules_that_end_where_the_loss_is_not_defined(schedules, message):
     TemperatureScheduler(loss, tau=linear(0.5, 0.0, 10), tau_prime=lambda count: 0.1)
     with pytest.raises(TypeError, match=r"schedule of tau must be a function.*constant\(0.5\)"):
         TemperatureScheduler(loss, tau=0.5)
+
+
+def test_a_step_that_is_refused_changes_nothing():
+    loss = ECPOLoss(make_softmax_policy(torch.eye(4)), tau=0.5, tau_prime=0.1)
+    schedules = {"tau": linear(0.5, 0.1, 10), "tau_prime": lambda count: 0.1 if count < 5 else -1}
+    temperatures = TemperatureScheduler(loss, **schedules)
+    for move in (temperatures.step, lambda count: temperatures.load_state_dict({"count": count})):
+        with pytest.raises(ValueError, match="tau_prime must be"):
+            move(7)
+        assert temperatures.state_dict() == {"count": 0.0}
+        assert (loss.tau.item(), loss.tau_prime.item()) == pytest.approx((0.5, 0.1))
+    temperatures.step(4)
+    assert loss.tau.item() == pytest.approx(0.34)
+
+
+def test_what_is_learned_is_not_scheduled():
+    """Also where it would end at what is not allowed."""
+    loss = REPSLoss(make_softmax_policy(torch.eye(4)))
+    with pytest.raises(AttributeError, match="tau is learned"):
+        TemperatureScheduler(loss, tau=linear(1.0, 0.0, 100))
 
 
 @pytest.mark.parametrize(

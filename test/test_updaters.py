@@ -20,7 +20,9 @@ from torchrl.objectives import (
     TargetNetUpdater,
 )
 
+from torchrl_ecpo import ECACLoss
 from torchrl_ecpo._torchrl import networks_with_updater
+from torchrl_ecpo.modules import make_qvalue_network, make_tanh_gaussian_actor
 from torchrl_ecpo.updaters import PeriodicCopy, PolyakAverage, UpdaterSequence
 
 OBSERVATIONS, ACTIONS, HIDDEN = 3, 2, 4
@@ -200,6 +202,13 @@ def test_averages_in_half_precision_arrive_also_when_resumed(dtype):
     leaves(loss, "target_qvalue_network")["module", "output", "bias"].fill_(7)
     averages = updater.state_dict()["averages"]
     assert (averages["qvalue_network.module.output.bias"] == 7).all()
+
+
+def test_averages_in_half_precision_are_named_as_the_parameters():
+    actor = make_tanh_gaussian_actor(3, Bounded(-1.0, 1.0, shape=(2,)))
+    loss = ECACLoss(actor, make_qvalue_network(3, 2)).to(torch.bfloat16)
+    names = {f"qvalue_network.{part}_{i}" for part in ("weight", "bias") for i in range(3)}
+    assert {*PolyakAverage(loss, "qvalue_network").state_dict()["averages"]} == names
 
 
 UPDATERS = {

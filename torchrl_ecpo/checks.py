@@ -175,7 +175,9 @@ def unreadable(
         raise error
     values = {key: tensordict.get(key, None) for key in keys}
     told = [f"{key!r} {'(missing)' if x is None else described(x)}" for key, x in values.items()]
-    reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+    lines = (str(error).strip() or type(error).__name__).splitlines()
+    # Where an error only announces another one, that one is the reason.
+    reason = " ".join(lines[: 2 if lines[0].rstrip().endswith(":") else 1])
     kind = KeyError if isinstance(error, KeyError) else ValueError
     return kind(f"The {network} cannot be evaluated on {', '.join(told)}: {reason}")
 

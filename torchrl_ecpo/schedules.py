@@ -163,28 +163,34 @@ class TemperatureScheduler:
                 ) from error
         self.loss_module = loss_module
         self.schedules = schedules
-        self.count = 0.0
         if isinstance(loss_module, PolicyLoss):
             ends = {name: getattr(s, "keywords", {}).get("end") for name, s in schedules.items()}
             try:
                 loss_module.allowed_temperatures(**ends)
             except ValueError as error:
                 raise ValueError(f"Where the schedules end: {error}") from None
-        self._write()
+        self._move_to(0.0)
 
     def step(self, count: float = 1) -> None:
         """Advance by ``count``, at least 0, and write the temperatures."""
-        self.count += _number("count", count)
-        self._write()
+        self._move_to(self.count + _number("count", count))
 
     def values(self) -> dict[str, float]:
         """The temperatures as they stand, by name."""
-        return {name: float(schedule(self.count)) for name, schedule in self.schedules.items()}
+        return self._at(self.count)
 
-    def _write(self) -> None:
+    def _at(self, count: float) -> dict[str, float]:
+        return {name: float(schedule(count)) for name, schedule in self.schedules.items()}
+
+    def _move_to(self, count: float) -> None:
+        """Write the temperatures at a count, or none of them."""
+        values = self._at(count)
+        if isinstance(self.loss_module, PolicyLoss):
+            self.loss_module.allowed_temperatures(**values)
         # The largest first: the loss refuses a moment in which all temperatures are 0.
-        for name, value in sorted(self.values().items(), key=lambda item: -item[1]):
+        for name, value in sorted(values.items(), key=lambda item: -item[1]):
             setattr(self.loss_module, name, value)
+        self.count = count
 
     def state_dict(self) -> dict[str, float]:
         """The count; the schedules are configuration."""
@@ -192,8 +198,7 @@ class TemperatureScheduler:
 
     def load_state_dict(self, state_dict: dict[str, float]) -> None:
         """Continue at a saved count, and write its temperatures."""
-        self.count = _number("count", state_dict["count"])
-        self._write()
+        self._move_to(_number("count", state_dict["count"]))
 
 
 # Functions of the module, so that schedules can be pickled.

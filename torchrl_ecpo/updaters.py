@@ -53,7 +53,6 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
-from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule, TargetNetUpdater
 
@@ -152,8 +151,8 @@ class _NetworkUpdater(TargetNetUpdater):
                         "buffers. Use them through "
                         "`params.to_module(net, preserve_module_state=False)`."
                     )
-                path = (network, *unravel_key((key,)))
-                yield ".".join(path), sources.get(key).data, target.data
+                path = (key,) if isinstance(key, str) else key
+                yield ".".join((network, *path)), sources.get(key).data, target.data
 
     def __repr__(self) -> str:
         arguments = [type(self.loss_module).__name__, *map(repr, self.networks)]

@@ -313,6 +313,9 @@ def test_dropout(model, config):
         ({"do_sample": True, "temperature": 0.7}, "temperature=0.7"),
         ({"do_sample": True, "top_k": 5}, "top_k=5"),
         ({"do_sample": True, "top_p": 0.9}, "top_p=0.9"),
+        ({"do_sample": True, "num_beams": 4}, "num_beams=4.*Set it to 1 "),
+        ({"do_sample": True, "no_repeat_ngram_size": 1}, "no_repeat_ngram_size=1.*Set it to 0 "),
+        ({"do_sample": True, "bad_words_ids": [[4]]}, "bad_words_ids=.*Set it to None "),
     ],
 )
 def test_other_distributions(settings, words):

@@ -99,6 +99,18 @@ def test_short_answers_are_learned(make_trainer):
     assert logged[-1]["reward"] > logged[0]["reward"] + 1
 
 
+@pytest.mark.parametrize("options", [{}, {"gradient_accumulation_steps": 3, "num_iterations": 2}])
+def test_a_batch_is_recorded_also_where_trl_does_not(make_trainer, options):
+    """Where it is used once, and in an evaluation, which is not divided either."""
+    trainer = make_trainer(tiny.make_model(), logging_steps=1, **options)
+    trainer.train()
+    logged = [entry for entry in trainer.state.log_history if "reward" in entry]
+    assert logged
+    assert abs(logged[0]["kl_reference_policy"]) < 1e-4
+    told = trainer.evaluate(trainer.train_dataset)
+    assert told["eval_loss"] == pytest.approx(trainer.diagnostics["loss_actor"], rel=1e-4)
+
+
 def test_groups_that_are_cut_are_refused(make_trainer):
     trainer = make_trainer(tiny.make_model(), per_device_train_batch_size=3, steps_per_generation=2)
     with pytest.raises(ValueError, match="Groups of unequal size"):

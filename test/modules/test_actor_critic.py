@@ -5,13 +5,14 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, set_skip_existing
 from torch import nn
 from torchrl.data import Bounded, Categorical, MultiCategorical, OneHot
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import MLP
 from torchrl.objectives import SACLoss, SoftUpdate
 
+from torchrl_ecpo import ECACLoss
 from torchrl_ecpo.modules import (
     DenseNetwork,
     PixelEncoder,
@@ -183,6 +184,37 @@ def test_a_dense_network_starts_as_layers_of_torch_do():
     before = network.weight_0.detach().clone()
     network.reset_parameters()
     assert (network.weight_0 != before).float().mean() > 0.99
+
+
+def test_a_dense_network_is_drawn_anew_as_tensordict_asks_for_it():
+    """Also several sets of parameters at once, as of the critics of a loss."""
+    actor = make_tanh_gaussian_actor(3, Bounded(-1.0, 1.0, shape=(2,)))
+    loss = ECACLoss(actor, make_qvalue_network(3, 2), make_value_network(3))
+    old = {name: value.clone() for name, value in loss.state_dict().items()}
+    loss.reset_parameters_recursive()
+    drawn = {name for name, value in loss.state_dict().items() if (value != old[name]).any()}
+    assert drawn == {name for name in old if "params" in name and "__batch_size" not in name}
+    first, second = loss.qvalue_network_params.unbind(0)
+    assert (first["weight_0"] != second["weight_0"]).all()
+
+    network = DenseNetwork(["a"], ["out"], [3, 4, 1], final_gain=0)
+    own, given = network.weight_0.detach().clone(), TensorDict.from_module(network).data.clone()
+    before = given.clone()
+    drawn = network.reset_parameters_recursive(given)
+    assert (given["weight_0"] != before["weight_0"]).all()
+    torch.testing.assert_close(drawn["weight_0"], given["weight_0"])
+    assert (given["weight_1"] == 0).all()
+    assert torch.equal(network.weight_0, own)
+    with pytest.raises(RuntimeError, match="batched"):
+        network.reset_parameters_recursive(given.expand(2))
+
+
+def test_a_dense_network_skips_what_exists_where_it_is_asked_to():
+    network, value = DenseNetwork(["a"], ["out"], [3, 1]), torch.full((5, 1), 7.0)
+    with set_skip_existing(True):
+        written = network(TensorDict(a=torch.zeros(5, 3), out=value))["out"]
+    assert torch.equal(written, value)
+    assert (network(TensorDict(a=torch.zeros(5, 3), out=value))["out"] != value).all()
 
 
 def test_a_final_gain_is_a_factor_of_the_last_layer_alone():

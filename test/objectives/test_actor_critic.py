@@ -951,7 +951,11 @@ def test_temperatures_are_scheduled():
     loss, *_ = _trained(delay_actor=True)
     for name in ("tau", "tau_prime"):
         before = call(loss, _batch())["loss_actor"]
+        outputs = call(loss, _batch())
+        held = outputs[name].item()
         setattr(loss, name, 2)
+        assert outputs[name] == held, "what was reported stays"
+        outputs["loss_actor"].backward()
         outputs = call(loss, _batch())
         assert not torch.allclose(outputs["loss_actor"], before)
         assert outputs[name] == 2.0

@@ -284,7 +284,9 @@ def test_schedule_by_assignment(case):
     for name in case.temperatures:
         before = loss(batch)["loss_actor"]
         buffer = getattr(loss, name)
+        earlier = loss(batch)["loss_actor"]
         setattr(loss, name, 2)
+        earlier.backward()  # which is not disturbed
         assert getattr(loss, name) is buffer
         assert dict(loss.named_buffers())[name] is buffer
         assert name not in dict(loss.named_parameters())

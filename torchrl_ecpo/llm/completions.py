@@ -31,6 +31,16 @@ NEUTRAL: Mapping[str, tuple[float | None, ...]] = {
     "top_p": (None, 1),
     "min_p": (None, 0),
     "repetition_penalty": (None, 1),
+    "presence_penalty": (None, 0),
+    "frequency_penalty": (None, 0),
+    "typical_p": (None, 1),
+    "epsilon_cutoff": (None, 0),
+    "eta_cutoff": (None, 0),
+    "num_beams": (None, 1),
+    "no_repeat_ngram_size": (None, 0),
+    "min_length": (None, 0),
+    "min_new_tokens": (None, 0),
+    "bad_words_ids": (None,),
 }
 
 
@@ -74,10 +84,10 @@ def check_sampler(sampler: Any) -> None:
 
     Raises:
         ValueError: for greedy decoding (the default of transformers), a temperature other than 1,
-            top-k (by default, transformers draws from the 50 likeliest tokens), top-p, min-p or a
-            repetition penalty, be it the wrapper's or of the model's ``generation_config``;
-            where the padding token is one of those that end a completion there; and for a model
-            that the wrapper calls wrongly, such as GPT-2.
+            top-k (by default, transformers draws from the 50 likeliest tokens), top-p, min-p,
+            beams, penalties and what else changes probabilities, be it the wrapper's or of the
+            model's ``generation_config``; where the padding token is one of those that end a
+            completion there; and for a model that the wrapper calls wrongly, such as GPT-2.
 
     Examples:
         >>> from types import SimpleNamespace
@@ -143,9 +153,9 @@ def _check_settings(settings: Mapping[str, Any]) -> None:
         if settings[name] not in neutral:
             raise ValueError(
                 f"The sampler has {name}={settings[name]}, so that it draws from another "
-                "distribution than the model's own, which the loss takes the policy to be. Sample "
-                "with temperature=1 and top_p=1, and without top_k (transformers: "
-                "model.generation_config.top_k = 0)."
+                "distribution than the model's own, which the loss takes the policy to be. Set it "
+                f"to {neutral[1] if len(neutral) > 1 else None} in the sampler's options or, with "
+                "transformers, in model.generation_config."
             )
 
 

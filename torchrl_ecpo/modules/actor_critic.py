@@ -20,6 +20,7 @@ from tensordict.nn import (
     TensorDictModuleBase,
     TensorDictSequential,
     dispatch,
+    set_skip_existing,
 )
 from torch import Tensor, nn
 from torch.distributions import Categorical
@@ -119,7 +120,22 @@ class DenseNetwork(TensorDictModuleBase):
             for name in self._names[-2:]:
                 getattr(self, name).mul_(self.final_gain)
 
+    def reset_parameters_recursive(
+        self, parameters: TensorDictBase | None = None
+    ) -> TensorDictBase | None:
+        """Draw all parameters, or in place those that are given; see ``TensorDictModule``.
+
+        tensordict's own draws those of submodules alone, of which there are none.
+        """
+        if parameters is None:
+            return self.reset_parameters()
+        parameters = super().reset_parameters_recursive(parameters)
+        with parameters.to_module(self, preserve_module_state=False):
+            self.reset_parameters()
+        return parameters
+
     @dispatch(auto_batch_size=False)
+    @set_skip_existing(None)
     @names_entries
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the outputs into ``tensordict``."""

@@ -111,10 +111,7 @@ class PolicyLoss(LossModule):
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Write a temperature in place; refuse what is learned, and what is not allowed."""
-        if name in self._learned:
-            instead = self._learned[name][1]
-            mend = f" Build the loss without {instead} to set or schedule it." if instead else ""
-            raise AttributeError(f"{name} is learned.{mend}")
+        self._refuse_learned(name)
         names = self.__dict__.get("temperature_names", ())
         buffers = dict(self.named_buffers(recurse=False)) if name in names else {}
         if name not in buffers:
@@ -122,11 +119,19 @@ class PolicyLoss(LossModule):
             return
         buffers[name].fill_(self.allowed_temperatures(**{name: as_float(name, value)})[name])
 
+    def _refuse_learned(self, name: str) -> None:
+        if name in self._learned:
+            instead = self._learned[name][1]
+            mend = f" Build the loss without {instead} to set or schedule it." if instead else ""
+            raise AttributeError(f"{name} is learned.{mend}")
+
     def allowed_temperatures(self, **values: Any) -> dict[str, float]:
         """Numbers, by name; refuse those that are not allowed beside the other temperatures.
 
         None is a value that is not known, but positive.
         """
+        for name in values:
+            self._refuse_learned(name)
         buffers = dict(self.named_buffers(recurse=False))
         current = {name: buffers[name] for name in self.temperature_names if name in buffers}
         known = {name: value for name, value in {**current, **values}.items() if value is not None}
@@ -159,9 +164,12 @@ class PolicyLoss(LossModule):
         self._learned = {**self._learned, name: (floor, instead)}
 
     def temperature(self, name: str) -> Tensor:
-        """A temperature as it stands, 0-d and detached, scheduled or learned."""
+        """A temperature as it stands, 0-d and detached, scheduled or learned.
+
+        It stays as it is when another value is set.
+        """
         if name not in self._learned:
-            return getattr(self, name)
+            return getattr(self, name).clone()
         log_temperature: Tensor = getattr(self, f"log_{name}")
         return log_temperature.detach().exp().clamp_min(self._learned[name][0])
 
