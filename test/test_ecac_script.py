@@ -202,6 +202,12 @@ def test_tasks_and_ablations_run(tmp_path, train, options):
         assert metrics["tau"][1:] == pytest.approx([0.15, 0.1], abs=0.01)
 
 
+def test_a_schedule_of_what_is_learned_is_refused(tmp_path, train):
+    schedule = "loss.tau={schedule:linear,start:0.2,end:0.1,duration:160}"
+    with pytest.raises(ValueError, match=r"tau is learned\. Build the loss without target_kl"):
+        train(tmp_path, schedule)
+
+
 @pytest.mark.slow
 def test_workers_run(tmp_path):
     process = start(

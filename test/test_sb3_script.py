@@ -10,7 +10,7 @@ import torch
 from processes import run_script
 
 from torchrl_ecpo.envs import DeepSeaEnv
-from torchrl_ecpo.experiment import read_metrics
+from torchrl_ecpo.experiment import compose_options, read_metrics
 
 pytest.importorskip("sb3_contrib")
 PPO = Path(__file__).parents[1] / "sota-implementations/sb3/ppo.py"
@@ -41,6 +41,17 @@ def test_a_run_without_entropy_ends_where_it_is_asked_to(tmp_path):
     assert 0 < summary["trajectories"] < 40000
     assert max(metrics["entropy"][-2:]) < 0.1
     assert min(len(metrics["entropy"]), 3) == 2 or metrics["entropy"][-3] >= 0.1
+
+
+def test_options_are_checked_and_a_run_is_not_resumed(tmp_path):
+    for options, message in (
+        (["env.solved=true"], "env.solved must be a number"),
+        (["stop_when={batches:0}"], "stop_when.batches must be an integer >= 1"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            compose_options(PPO.parent, options)
+    process = run_script(tmp_path, PPO, f"resume={tmp_path}")
+    assert f"ppo.py: resume={tmp_path}: ppo.py writes no checkpoints" in process.stderr
 
 
 def test_the_deep_sea_is_the_one_of_the_groups(beside):

@@ -202,6 +202,9 @@ def test_episodes_and_groups_that_earn_as_much_are_counted(script):
     reward[1, 1, 0] = 1.0  # a second way in the group, and in the first one the same again
     groups["next", "reward"][0] = 1.0
     assert passes(groups, solved=1)["distinct_solutions"] == 1
+    reward[2, 1] = torch.tensor([1 - 1e-7, 0.0])  # as of parts that add up to 1
+    assert passes(groups, solved=1)["pass_at_1"] == pytest.approx(5 / 6)
+    reward[2, 1] = 0.0
     groups["other", "action"] = torch.randn(3, 2, 2, 5)  # the same by one part of the action
     keys = ["action", ("other", "action")]
     assert passes(groups, solved=1, action_keys=keys)["distinct_solutions"] == pytest.approx(4 / 3)
@@ -527,8 +530,10 @@ def test_groups_of_eight_learn_cartpole(tmp_path):
 
 def test_a_metric_that_a_run_does_not_have_is_refused(tmp_path, train):
     message = r"anneal_from\.metric and stop_when\.metric must be one of"
-    with pytest.raises(KeyError, match=message):
-        train(tmp_path, "anneal_from={metric:foo,at_least:1}")
+    for goal in ("anneal_from={metric:foo,at_least:1}", "stop_when={metric:foo,at_least:1,batches:2}"):
+        with pytest.raises(KeyError, match=message):
+            train(tmp_path, goal)
+        assert not (tmp_path / "metrics.csv").exists(), "it was refused before it began"
 
 
 def test_distinct_solutions_are_counted(script):

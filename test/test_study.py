@@ -307,7 +307,7 @@ def test_what_is_done_is_skipped_and_more_seeds_are_taken_on(run, tmp_path, coun
 
 
 def test_seeds_are_stacked_and_what_has_begun_goes_on_as_it_was(study, run, tmp_path, counter):
-    add_option(counter, "seeds: null")
+    add_option(counter, "seeds: null\nenv: {kind: bandit}")
     cells = study.manifest.read_manifests([plan(tmp_path, counter, s={"seeds": "1-5"})]).select()
     base = cells[0].directory(tmp_path)
 
@@ -321,6 +321,15 @@ def test_seeds_are_stacked_and_what_has_begun_goes_on_as_it_was(study, run, tmp_
     assert processes() == {(2, 4, 7): "seeds_2_4_7", (1, 3): "seeds_1_3", (5,): "seed_5"}
     stack, *_ = study.run.planned_runs(cells, tmp_path, stack=2)
     assert stack.command[2:6] == ["name=one", "speed=1.0", "seeds=[1,3]", "total_frames=4"]
+
+
+def test_tasks_that_cannot_be_stacked_are_made_one_by_one(study, beside, tmp_path, counter):
+    add_option(counter, "seeds: null\nenv: {kind: gym}")
+    cells = study.manifest.read_manifests([plan(tmp_path, counter, s={})]).select()
+    runs = study.run.planned_runs(cells, tmp_path, stack=2)
+    assert [each.seeds for each in runs] == [(1,), (2,)]
+    beside("ecpo", "stacked")
+    assert beside("ecpo", "stacked.options").KINDS == study.run.STACKED_KINDS
 
 
 @pytest.mark.slow  # real runs, of which the queue starts each in a new interpreter
@@ -560,6 +569,22 @@ def test_longer_curves_take_the_place_of_shorter_ones_of_the_same_run(
     for entries, last in ((shorter, 100), (longer, 200), (shorter, 200)):
         results = collect(study, tmp_path, plan(tmp_path, counter, s=entries))
         assert results.curves["one", "A", "", 1][-1]["step"] == last
+
+
+def test_a_metric_that_the_study_also_shows_since_is_taken_in(study, run, tmp_path, counter):
+    path = plan(tmp_path, counter, s={"seeds": "1"})
+    make_runs(run, path)
+    bare = collect(study, tmp_path, path).curves["one", "A", "", 1]
+    (record,) = (tmp_path / "runs").rglob("metrics.csv")
+    head, *rows = record.read_text().split()
+    record.write_text("\n".join([f"{head},length", *(f"{row},7" for row in rows)]) + "\n")
+    assert collect(study, tmp_path, path).curves["one", "A", "", 1] == bare
+    path = plan(tmp_path, counter, s={"seeds": "1", "also": ["length"]})
+    more = [{**point, "length": 7} for point in bare]
+    assert collect(study, tmp_path, path).curves["one", "A", "", 1] == more
+    # One without it is no better.
+    record.write_text("\n".join([head, *rows]) + "\n")
+    assert collect(study, tmp_path, path).curves["one", "A", "", 1] == more
 
 
 def test_a_strange_directory_keeps_no_other_run_out(study, run, tmp_path, counter, capfd):

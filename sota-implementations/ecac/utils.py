@@ -233,7 +233,10 @@ def make_temperatures(config: DictConfig, loss_module: LossModule) -> Temperatur
         for name, setting in settings.items()
         if isinstance(setting, DictConfig)
     }
-    return TemperatureScheduler(loss_module, **schedules)
+    try:
+        return TemperatureScheduler(loss_module, **schedules)
+    except AttributeError as error:  # which has no message of its own for a user of the script
+        raise ValueError(f"A temperature with a schedule: {error}") from error
 
 
 def make_updater(config: DictConfig, loss_module: LossModule) -> TargetNetUpdater | None:

@@ -20,6 +20,7 @@ from tasks import Metrics, make_task
 from torch.nn.utils import clip_grad_norm_
 from utils import (
     Watch,
+    check_goals,
     goes_on,
     held,
     is_far,
@@ -101,6 +102,7 @@ def main(config: DictConfig) -> None:
                 metrics = of_batch(of_steps) | task.measure(groups) | temperatures.values()
                 if progress.project_steps % config.evaluation.interval == 0:
                     metrics |= task.evaluate(groups)
+                check_goals(config, metrics)
                 run.log(metrics, step=progress.trajectories)
                 watch(metrics)
                 progress.held = held(config.stop_when, progress.held, metrics)

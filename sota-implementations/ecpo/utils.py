@@ -235,6 +235,12 @@ def reached(goal: DictConfig | None, metrics: Metrics) -> bool:
     return bool(metrics[goal.metric] >= goal.at_least)
 
 
+def check_goals(config: DictConfig, metrics: Metrics) -> None:
+    """Refuse a goal whose metric a batch does not have, before anything of it is recorded."""
+    for goal in (config.anneal_from, config.stop_when):
+        reached(goal, metrics)
+
+
 def held(goal: DictConfig | None, so_far: int, metrics: Metrics) -> int:
     """For how many batches in a row a metric has been up to a goal; once enough, always."""
     if goal is None or so_far >= goal.batches:

@@ -22,7 +22,7 @@ from transformers import TrainerCallback
 from trl import GRPOConfig, GRPOTrainer  # pyright: ignore[reportPrivateImportUsage]
 from utils import Policy, check_run, make_model
 
-from torchrl_ecpo.experiment import Run, leaving_nothing
+from torchrl_ecpo.experiment import Run, leaving_nothing, refuse_resume
 
 
 class Logged(TrainerCallback):
@@ -44,11 +44,7 @@ class Logged(TrainerCallback):
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
 @leaving_nothing
 def main(config: DictConfig) -> None:
-    if config.resume not in (None, "auto"):
-        raise ValueError(
-            f"resume={config.resume}: by_trl.py writes no checkpoints, and would begin anew there. "
-            "Leave out resume."
-        )
+    refuse_resume(config)
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     task = TASKS[config.env]

@@ -31,7 +31,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import Tensor, nn
 
 from torchrl_ecpo.envs import DeepSeaEnv, readable
-from torchrl_ecpo.experiment import Run, leaving_nothing
+from torchrl_ecpo.experiment import Run, leaving_nothing, refuse_resume
 
 LEAST_ENTROPY = 0.1  # nats an episode
 
@@ -126,6 +126,7 @@ def make_env(config: DictConfig) -> gym.Env:
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
 @leaving_nothing
 def main(config: DictConfig) -> None:
+    refuse_resume(config)
     torch.set_num_threads(1)
     envs: Any = DummyVecEnv([partial(make_env, config)] * config.n_envs)
     if config.normalize:

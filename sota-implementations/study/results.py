@@ -69,6 +69,8 @@ class Results:
     ) -> bool:
         """Take a run in, unless one of the cell and seed is there that went as far.
 
+        One that went as far, and has more of the metrics, replaces it.
+
         Runs of the cell that were made with another configuration are dropped, but for entries
         that are ignored.
         """
@@ -81,10 +83,14 @@ class Results:
             )
             self._drop(cell)
         key = (cell.task.name, cell.method, cell.label, record.seed)
-        if key in self.runs and recorded(self.runs[key]) >= min(record.reached, cell.steps):
-            return False
+        curve = thin(record.metrics, metrics, cell.steps)
+        if key in self.runs:
+            further = min(record.reached, cell.steps) - recorded(self.runs[key])
+            has_more = _names(curve) > _names(self.curves.get(key, []))
+            if further < 0 or (further == 0 and not has_more):
+                return False
         self.configs[cell.name] = config
-        self.curves[key] = thin(record.metrics, metrics, cell.steps)
+        self.curves[key] = curve
         if record.stopped_at is not None:
             self.curves[key] = extended(self.curves[key], cell.steps)
         values = {
@@ -234,6 +240,10 @@ def extended(points: Sequence[Point], steps: int) -> list[Point]:
 def _but_for_the_seed(identity: Mapping[str, float | str]) -> dict[str, float | str]:
     """What the runs of a cell share; the bandit's instance is named after the seed too."""
     return {name: value for name, value in identity.items() if not name.endswith("seed")}
+
+
+def _names(points: Sequence[Point]) -> set[str]:
+    return {name for point in points for name in point}
 
 
 def _key(row: Mapping[str, str]) -> Key:

@@ -31,11 +31,13 @@ from manifest import (
     changed_entries,
     read_manifests,
 )
+from omegaconf import OmegaConf
 from records import Record, find_record
 from results import RESULTS, Results
 
 POLL = 0.2  # seconds
 LOG_LINES = 12
+STACKED_KINDS = ("algorithmic", "bandit")  # of tasks, as ecpo/stacked/options.py has it
 # One thread a run: fastest at these sizes, and as many runs as cores.
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "MUJOCO_GL": "disabled"}
 
@@ -119,11 +121,13 @@ def planned_runs(
                 by_seed[seed] = cell
     runs = []
     for base, by_seed in wanted.items():
-        size = stack if "seeds" in next(iter(by_seed.values())).config else 1
+        config = next(iter(by_seed.values())).config
+        kind = OmegaConf.select(config, "env.kind")
+        size = stack if "seeds" in config and kind in STACKED_KINDS else 1
         for seeds in partition(list(by_seed), begun(base), size):
             longest = max((by_seed[s] for s in seeds if s in by_seed), key=lambda cell: cell.steps)
-            kind = "seed" if len(seeds) == 1 else "seeds"
-            run = Run(longest, seeds, base / "_".join([kind, *map(str, seeds)]), ignored)
+            name = "seed" if len(seeds) == 1 else "seeds"
+            run = Run(longest, seeds, base / "_".join([name, *map(str, seeds)]), ignored)
             runs.append((min(list(by_seed).index(s) for s in seeds if s in by_seed), run))
     return [run for _, run in sorted(runs, key=lambda pair: pair[0])]
 

@@ -8,7 +8,13 @@ if TYPE_CHECKING:
     from torchrl_ecpo.experiment.checkpoint import Checkpoints, Progress, restore_part
     from torchrl_ecpo.experiment.compiling import compile_module
     from torchrl_ecpo.experiment.options import check_command_line, compose_options
-    from torchrl_ecpo.experiment.run import MetricsTable, Run, leaving_nothing, read_metrics
+    from torchrl_ecpo.experiment.run import (
+        MetricsTable,
+        Run,
+        leaving_nothing,
+        read_metrics,
+        refuse_resume,
+    )
 
 __all__ = [
     "Checkpoints",
@@ -20,6 +26,7 @@ __all__ = [
     "compose_options",
     "leaving_nothing",
     "read_metrics",
+    "refuse_resume",
     "restore_part",
 ]
 

@@ -233,21 +233,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
         comparison = load_comparison(
             runs, options.metric, by=options.by, smoothing=options.smoothing
         )
-    except (FileNotFoundError, KeyError, ValueError) as error:
+        print(comparison.table())
+        for run in filter(_is_unfinished, runs):
+            print(f"not finished, and curves are as long as the shortest one: {run}")
+        if options.csv is not None:
+            print(f"curves: {comparison.write(options.csv).resolve()}")
+        picture = plot_comparison(
+            {options.title: comparison.curves},
+            options.output or options.directories[0] / "comparison.png",
+            x_label=options.x_label or _unit(runs[0]),
+            y_label=comparison.metric,
+        )
+        print(f"picture: {picture.resolve()}")
+    except (OSError, KeyError, ValueError) as error:
         # A KeyError in words has quotes; the first argument of a system's error is its number.
         parser.error(error.args[0] if isinstance(error, KeyError) else str(error))
-    print(comparison.table())
-    for run in filter(_is_unfinished, runs):
-        print(f"not finished, and curves are as long as the shortest one: {run}")
-    if options.csv is not None:
-        print(f"curves: {comparison.write(options.csv).resolve()}")
-    picture = plot_comparison(
-        {options.title: comparison.curves},
-        options.output or options.directories[0] / "comparison.png",
-        x_label=options.x_label or _unit(runs[0]),
-        y_label=comparison.metric,
-    )
-    print(f"picture: {picture.resolve()}")
 
 
 if __name__ == "__main__":

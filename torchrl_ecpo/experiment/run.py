@@ -276,7 +276,11 @@ class Run:
             config.logger.backend,
             logger_name=str(self.directory),
             experiment_name=self.name.replace("/", "_"),
-            wandb_kwargs={"project": config.logger.project, "mode": config.logger.wandb_mode},
+            wandb_kwargs={
+                "project": config.logger.project,
+                "mode": config.logger.wandb_mode,
+                "reinit": "create_new",  # of stacked runs each has its own
+            },
         )
         assert logger is not None
         logger.log_hparams(flatten(OmegaConf.to_container(config, resolve=True)))
@@ -400,6 +404,19 @@ def leaving_nothing(main: Callable[[DictConfig], None]) -> Callable[[DictConfig]
             lock.release()
 
     return run
+
+
+def refuse_resume(config: DictConfig) -> None:
+    """For a script that writes no checkpoints.
+
+    Raises:
+        ValueError: for ``resume=`` of a directory.
+    """
+    if config.resume not in (None, "auto"):
+        raise ValueError(
+            f"resume={config.resume}: {_script()} writes no checkpoints, and would begin anew "
+            "there. Leave out resume."
+        )
 
 
 def _script() -> str:

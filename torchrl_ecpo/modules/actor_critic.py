@@ -129,10 +129,10 @@ class DenseNetwork(TensorDictModuleBase):
         """
         if parameters is None:
             return self.reset_parameters()
-        parameters = super().reset_parameters_recursive(parameters)
-        with parameters.to_module(self, preserve_module_state=False):
+        drawn: Any = super().reset_parameters_recursive(parameters)  # refuses what is batched
+        with drawn.to_module(self, preserve_module_state=False):
             self.reset_parameters()
-        return parameters
+        return drawn
 
     @dispatch(auto_batch_size=False)
     @set_skip_existing(None)

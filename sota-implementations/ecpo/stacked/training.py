@@ -18,6 +18,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 from utils import (
+    check_goals,
     goes_on,
     held,
     is_far,
@@ -175,6 +176,7 @@ class Stack:
                 with self.collector.policy.streams.drawing_from(index):
                     metrics |= member.task.evaluate(part)
             member.metrics = metrics
+            check_goals(member.config, metrics)
             member.run.log(metrics, step=self.progress.trajectories)
             so_far = self.progress.held[index]
             self.progress.held[index] = held(member.config.stop_when, so_far, metrics)
