@@ -530,7 +530,10 @@ def test_groups_of_eight_learn_cartpole(tmp_path):
 
 def test_a_metric_that_a_run_does_not_have_is_refused(tmp_path, train):
     message = r"anneal_from\.metric and stop_when\.metric must be one of"
-    for goal in ("anneal_from={metric:foo,at_least:1}", "stop_when={metric:foo,at_least:1,batches:2}"):
+    for goal in (
+        "anneal_from={metric:foo,at_least:1}",
+        "stop_when={metric:foo,at_least:1,batches:2}",
+    ):
         with pytest.raises(KeyError, match=message):
             train(tmp_path, goal)
         assert not (tmp_path / "metrics.csv").exists(), "it was refused before it began"
