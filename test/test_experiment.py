@@ -145,6 +145,19 @@ def test_other_loggers_come_beside_the_record(tmp_path, backend, monkeypatch):
     assert read_metrics(tmp_path)["return"] == [1, 2, 4]
 
 
+@pytest.mark.slow
+def test_runs_of_one_process_have_wandb_runs_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    folders = [tmp_path / "one", tmp_path / "other"]
+    for folder in folders:
+        folder.mkdir()
+    one, other = (make_run(folder, make_config("wandb")) for folder in folders)
+    with one, other:
+        record(one)
+        record(other)
+    assert [len(list(folder.rglob("*.wandb"))) for folder in folders] == [1, 1]
+
+
 def test_a_folder_without_a_record_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no metrics\.csv in .*directory of a run"):
         read_metrics(tmp_path)

@@ -235,7 +235,7 @@ def make_temperatures(config: DictConfig, loss_module: LossModule) -> Temperatur
     }
     try:
         return TemperatureScheduler(loss_module, **schedules)
-    except AttributeError as error:  # which has no message of its own for a user of the script
+    except AttributeError as error:  # of which scripts would show a traceback
         raise ValueError(f"A temperature with a schedule: {error}") from error
 
 
