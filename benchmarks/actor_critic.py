@@ -14,14 +14,13 @@ HalfCheetah-v5. Figures are medians of processor time, which other processes dis
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from csv_table import add_csv_option, write_csv
+from common import read_arguments, write_csv
 from hydra import compose, initialize_config_dir
 from loop import Iteration, take_turns
 from omegaconf import DictConfig
@@ -183,11 +182,7 @@ def compare(kind: str, iterations: dict[str, Iteration], repeats: int) -> list[d
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--repeats", type=int, default=10)
-    add_csv_option(parser)
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
+    arguments = read_arguments(__doc__, repeats=10)
     peer = peer_loop()
     updates = {name: update(configure(overrides)) for name, overrides in UPDATES.items()}
     rows = compare("update", updates, arguments.repeats)

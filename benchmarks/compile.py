@@ -11,23 +11,16 @@ run has left in inductor's cache it would be less, so that cache starts empty.
 
 from __future__ import annotations
 
-import argparse
 import time
 
-import torch
 from actor_critic import NUM_UPDATES, configure, update
-from csv_table import add_csv_option, write_csv
+from common import read_arguments, write_csv
 from loop import take_turns
 from torch._inductor.utils import fresh_cache
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--losses", nargs="+", default=["sac", "ecac"])
-    parser.add_argument("--repeats", type=int, default=10)
-    add_csv_option(parser)
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
+    arguments = read_arguments(__doc__, losses=["sac", "ecac"], repeats=10)
     table = []
     for loss in arguments.losses:
         config = configure([f"loss={loss}"])

@@ -11,7 +11,6 @@ time.
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from typing import Any
@@ -19,7 +18,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from csv_table import add_csv_option, write_csv
+from common import read_arguments, write_csv
 from gymnasium.spaces import Discrete, MultiDiscrete
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, GymWrapper, SerialEnv
@@ -96,14 +95,7 @@ def seconds(env: EnvBase, num_steps: int) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--copies", type=int, nargs="+", default=[8, 16])
-    parser.add_argument("--min-length", type=int, default=10)
-    parser.add_argument("--steps", type=int, default=100)
-    parser.add_argument("--repeats", type=int, default=7)
-    add_csv_option(parser)
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
+    arguments = read_arguments(__doc__, copies=[8, 16], min_length=10, steps=100, repeats=7)
     torch.manual_seed(0)
     batched = AlgorithmicEnv(
         "reverse",

@@ -17,7 +17,6 @@ a part of what "vector" loses.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 from functools import partial
@@ -27,7 +26,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import torch
-from csv_table import add_csv_option, write_csv
+from common import read_arguments, write_csv
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 from minigrid.wrappers import ImgObsWrapper
 from tensordict.nn import TensorDictModule
@@ -140,11 +139,7 @@ def measure(task: Task, turns: int) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--turns", type=int, default=5)
-    add_csv_option(parser)
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
+    arguments = read_arguments(__doc__, turns=5)
     torch.manual_seed(0)
     rows: list[dict[str, Any]] = []
     print(f"{'':24} {'bare':>9} {'vector':>9} {'grouped':>9}  v / bare  v / grouped")

@@ -13,7 +13,6 @@ in MB. One size varies at a time, the others are as in the first row.
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
 import resource
 import statistics
@@ -22,7 +21,7 @@ from collections.abc import Callable
 
 import torch
 from actor_critic import configure, make_parts, random_batch
-from csv_table import add_csv_option, write_csv
+from common import read_arguments, write_csv
 from ecac import total  # pyright: ignore[reportMissingImports]
 from loop import NUM_OBSERVATIONS, NVEC, TAU, TAU_PRIME
 from tensordict import TensorDict
@@ -97,11 +96,7 @@ def measure(loss: str, sizes: dict[str, int], repeats: int) -> tuple[float, floa
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--repeats", type=int, default=10)
-    add_csv_option(parser)
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
+    arguments = read_arguments(__doc__, repeats=10)
     table = []
     # A fork starts with the memory of the parent, which has computed nothing.
     with multiprocessing.get_context("fork").Pool(1, maxtasksperchild=1) as processes:

@@ -13,10 +13,8 @@ half to full length, of which 40 % are right (reward 1, else 0). The mean over 2
 
 from __future__ import annotations
 
-import argparse
-
 import torch
-from csv_table import add_csv_option, write_csv
+from common import read_arguments, write_csv
 from torch import Tensor
 
 from torchrl_ecpo.functional import (
@@ -55,9 +53,7 @@ def log_weights(length: int) -> dict[str, Tensor]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    add_csv_option(parser)
-    arguments = parser.parse_args()
+    arguments = read_arguments(__doc__)
     torch.manual_seed(0)
     table: dict[str, dict[str, object]] = {}
     for length in LENGTHS:

@@ -10,14 +10,13 @@ more.
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from collections.abc import Callable
 from typing import Any
 
 import torch
-from csv_table import add_csv_option, write_csv
+from common import read_arguments, write_csv
 from tensordict import TensorDict
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
@@ -116,11 +115,7 @@ def measure(sizes: tuple[int, int, int], repeats: int) -> dict[str, tuple[float,
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--repeats", type=int, default=3)
-    add_csv_option(parser)
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
+    arguments = read_arguments(__doc__, repeats=3)
     table = []
     for sizes in SIZES:
         found = measure(sizes, arguments.repeats)

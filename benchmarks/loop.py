@@ -34,7 +34,7 @@ from copy import deepcopy
 from typing import Any, NamedTuple
 
 import torch
-from csv_table import add_csv_option, write_csv
+from common import read_arguments, write_csv
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils import clip_grad_norm_
@@ -356,16 +356,9 @@ def print_profile(arguments: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--levels", type=int, nargs="+", default=[2, 10, 30])
-    parser.add_argument("--groups", type=int, default=40)
-    parser.add_argument("--stray", type=float, default=STRAY)
-    parser.add_argument("--write", type=float, default=WRITE)
-    parser.add_argument("--repeats", type=int, default=10)
-    parser.add_argument("--profile", action="store_true", help="of a step, at the first level")
-    add_csv_option(parser)
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
+    arguments = read_arguments(
+        __doc__, levels=[2, 10, 30], groups=40, stray=STRAY, write=WRITE, repeats=10, profile=False
+    )
     if arguments.profile:
         print_profile(arguments)
         return

@@ -14,11 +14,10 @@ true one, in per cent of it; that of the variance is in per cent of the true one
 
 from __future__ import annotations
 
-import argparse
 from typing import Any
 
 import torch
-from csv_table import add_csv_option, write_csv
+from common import read_arguments, write_csv
 from torch import Tensor
 
 from torchrl_ecpo.functional import lifted_gaussian_moments
@@ -78,9 +77,7 @@ def measure(estimator: str, m: int, size: int) -> dict[str, Any]:
 
 def main() -> None:
     """Print the table, and write it where it is to go."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    add_csv_option(parser)
-    path = parser.parse_args().csv
+    path = read_arguments(__doc__).csv
     rows = [measure(*case, size) for size in SIZES for case in CASES]
     for row in rows:
         print(*(f"{x:.3f}" if isinstance(x, float) else x for x in row.values()))

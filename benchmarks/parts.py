@@ -11,7 +11,6 @@ One thread, one process, median processor time in milliseconds.
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -19,7 +18,7 @@ from contextlib import contextmanager
 
 import torch
 from actor_critic import configure, make_data, make_parts
-from csv_table import add_csv_option, write_csv
+from common import read_arguments, write_csv
 from ecac import total  # pyright: ignore[reportMissingImports]
 from loop import (
     GROUP_SIZE,
@@ -131,11 +130,7 @@ def measure(iterate: Iteration, repeats: int) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--repeats", type=int, default=20)
-    add_csv_option(parser)
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
+    arguments = read_arguments(__doc__, repeats=20)
     scripts = {"ecpo": ecpo(), "ecac": control("ecac"), "sac": control("sac")}
     table = []
     for script, iterate in scripts.items():

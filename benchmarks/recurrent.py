@@ -11,14 +11,13 @@ every step; "share" is the part of all histories that is distinct.
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from csv_table import add_csv_option, write_csv
+from common import read_arguments, write_csv
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
@@ -119,16 +118,15 @@ def medians(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--steps", type=int, nargs="+", default=[10, 35, 66])
-    parser.add_argument("--branch", type=float, nargs="+", default=[0.01, 0.05, 0.2])
-    parser.add_argument("--groups", type=int, default=40)
-    parser.add_argument("--rollouts", type=int, default=10)
-    parser.add_argument("--hidden-size", type=int, default=128)
-    parser.add_argument("--repeats", type=int, default=5)
-    add_csv_option(parser)
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
+    arguments = read_arguments(
+        __doc__,
+        steps=[10, 35, 66],
+        branch=[0.01, 0.05, 0.2],
+        groups=40,
+        rollouts=10,
+        hidden_size=128,
+        repeats=5,
+    )
     torch.manual_seed(0)
     policies = [
         make(NUM_OBSERVATIONS, NVEC, hidden_size=arguments.hidden_size)

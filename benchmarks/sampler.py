@@ -5,13 +5,12 @@ Run: python benchmarks/sampler.py
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 from statistics import median
 
 import torch
-from csv_table import add_csv_option, write_csv
+from common import read_arguments, write_csv
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
@@ -73,12 +72,7 @@ def measure(size: int, repeats: int) -> tuple[float, ...]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sizes", type=float, nargs="+", default=[1e4, 3e4, 1e5, 3e5, 1e6])
-    parser.add_argument("--repeats", type=int, default=100)
-    add_csv_option(parser)
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
+    arguments = read_arguments(__doc__, sizes=[1e4, 3e4, 1e5, 3e5, 1e6], repeats=100)
     torch.manual_seed(0)
     print(f"{NUM_GROUPS} groups of {GROUP_SIZE} trajectories a draw and a write, one thread")
     columns = ("steps", "write ms", "write+draw ms", "draw ms", "sample ms")

@@ -10,7 +10,6 @@ medians of processor time, in turns.
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 from statistics import median
@@ -20,18 +19,13 @@ os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_paralleli
 
 import sbx  # pyright: ignore[reportMissingImports]
 import stable_baselines3  # pyright: ignore[reportMissingImports]
-import torch
-from csv_table import add_csv_option, write_csv
+from common import read_arguments, write_csv
 
 FRAMES = 200  # in a turn
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--repeats", type=int, default=10)
-    add_csv_option(parser)
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
+    arguments = read_arguments(__doc__, repeats=10)
     packages = {"Stable-Baselines3 SAC": stable_baselines3, "sbx SAC": sbx}
     options = {"learning_starts": 0, "seed": 0}
     models = {

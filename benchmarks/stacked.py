@@ -13,15 +13,13 @@ the learning rate is so small that they stay so. Without a level the policies ar
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
-import torch
-from csv_table import add_csv_option, write_csv
+from common import read_arguments, write_csv
 from hydra import compose, initialize_config_dir
 from loop import PROJECT_STEPS, Iteration, bias_to_last, take_turns
 from torch.nn.utils import clip_grad_norm_
@@ -105,13 +103,7 @@ def lengthen(task: Any, level: int | None) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--runs", type=int, nargs="+", default=[1, 2, 4, 8])
-    parser.add_argument("--levels", type=int, nargs="*", default=[2, 10], help="of Reverse")
-    parser.add_argument("--repeats", type=int, default=10)
-    add_csv_option(parser)
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
+    arguments = read_arguments(__doc__, runs=[1, 2, 4, 8], levels=[2, 10], repeats=10)
     cases = [("bandit", None), *(("reverse", level) for level in (None, *arguments.levels))]
     print("ms an iteration, processor time; gain: single runs over stacked")
     print("env      level  runs |  single  x runs  stacked |  gain")

@@ -708,7 +708,6 @@ def test_what_is_loaded_leaves_out_what_was_under_way():
         assert first == state["players"][worker]["next_id"] * 2 + worker
 
 
-@pytest.mark.usefixtures("forked_workers")
 class Unlicensed(Exception):
     def __init__(self, what, code):
         super().__init__(f"{what}: {code}")

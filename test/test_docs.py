@@ -6,7 +6,7 @@ import csv
 import re
 import shlex
 from functools import lru_cache
-from itertools import product, zip_longest
+from itertools import product
 from pathlib import Path
 from statistics import median
 from textwrap import dedent
@@ -14,9 +14,10 @@ from textwrap import dedent
 import pytest
 import yaml
 from hydra import compose, initialize_config_dir
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from processes import run_script
+
+from torchrl_ecpo.experiment.options import expand
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -111,23 +112,10 @@ def composed(config_directory: Path, overrides: tuple[str, ...]) -> DictConfig:
 
 
 def compose_command(script: Path, options: str) -> None:
-    """Compose the runs that a command line starts: of a sweep, every value of every option once.
-
-    Of seeds one, for they compose alike.
-    """
-    words = shlex.split(options, comments=True)
-    overrides = [word for word in words if not word.startswith("-")]
-    parsed = OverridesParser.create().parse_overrides(overrides)
-    choices = [
-        [f"{override.key_or_group}={value}" for value in override.sweep_string_iterator()]
-        if override.is_sweep_override()
-        else [str(override.input_line)]
-        for override in parsed
-    ]
-    choices = [values[:1] if values[0].startswith("seed=") else values for values in choices]
-    for run in list(zip_longest(*choices)) or [()]:
-        overrides = (value or values[0] for value, values in zip(run, choices, strict=True))
-        config = composed(script.parent / "config", tuple(overrides))
+    """Compose the runs that a command line starts; of seeds one, for they compose alike."""
+    words = [word for word in shlex.split(options, comments=True) if not word.startswith("-")]
+    for run in expand([re.sub(r"^seed=.*", "seed=1", word) for word in words]):
+        config = composed(script.parent / "config", tuple(run))
         OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
 
 

@@ -24,7 +24,6 @@ from omegaconf import OmegaConf
 from rliable.metrics import probability_of_improvement
 
 from torchrl_ecpo.experiment import options
-from torchrl_ecpo.experiment.compare import final
 from torchrl_ecpo.experiment.figures import METHOD_COLOURS, colours_of
 
 ROOT = Path(__file__).parents[1]
@@ -241,6 +240,8 @@ def test_a_choice_of_studies_tasks_methods_and_seeds(study, tmp_path, counter):
         ({"rank_by": "best"}, "study s: rank_by must be one of .*'final'.*, got 'best'"),
         ({"kind": "heat_map"}, "study s: a heat map needs a grid of two axes"),
         ({"methods": {"A": ["x=1"]}}, "method A must be options of the script, or a mapping"),
+        ({"methods": {"A": None}}, "method A must be options of the script, or a mapping"),
+        ({"methods": ["A"]}, "study s: methods must be a mapping"),
         ({"methods": {"A": {"options": "", "script": "no.py"}}}, "study s: there is no script no"),
         ({"scale_by": "Z"}, r"study s: scale_by: unknown \['Z'\]"),
         ({"steps": 0}, "study s: steps must be an integer of at least 1, got 0"),
@@ -843,11 +844,6 @@ def test_who_solves_what_is_as_the_report_has_it(page):
 
 
 # ------------------------------------------------------------------------------------------ scores
-
-
-def test_the_last_tenth_is_a_tenth(study):
-    steps = np.arange(1.0, 101.0)
-    assert final(steps, steps[None]).tolist() == [95.5]
 
 
 @pytest.mark.parametrize(

@@ -84,9 +84,9 @@ class Study:
     name: str
     title: str
     tasks: tuple[str, ...]
-    methods: Mapping[str, str | Mapping[str, Any]]
-    """Options of the script; or a mapping with these, and a ``grid`` of values of further options,
-    or ``seeds`` or a ``script`` of its own."""
+    methods: Mapping[str, Mapping[str, Any]]
+    """``options`` of the script, and perhaps a ``grid`` of values of further ones, or ``seeds`` or
+    a ``script`` of its own. In a file, options alone may stand for the mapping."""
     seeds: tuple[int, ...]
     about: str = ""
     kind: str = "curves"
@@ -234,11 +234,11 @@ class Manifest:
         return [
             Cell(
                 study=study.name,
-                task=_task_of(plan, task),
+                task=dataclasses.replace(task, script=plan.get("script", task.script)),
                 method=method,
                 setting=setting,
                 options=(*shlex.split(task.options or f"env={task.name}"), *options),
-                seeds=_seeds_of(plan) or study.seeds,
+                seeds=parse_seeds(plan["seeds"]) if "seeds" in plan else study.seeds,
                 steps=_steps_of(study, task),
             )
             for task in (self.tasks[name] for name in study.tasks)
@@ -282,22 +282,10 @@ def _steps_of(study: Study, task: Task) -> int:
     return (own.get(task.name) if isinstance(own, Mapping) else own) or task.steps
 
 
-def _task_of(plan: str | Mapping[str, Any], task: Task) -> Task:
-    own = None if isinstance(plan, str) else plan.get("script")
-    return task if own is None else dataclasses.replace(task, script=own)
-
-
-def _seeds_of(plan: str | Mapping[str, Any]) -> tuple[int, ...]:
-    own = None if isinstance(plan, str) else plan.get("seeds")
-    return () if own is None else parse_seeds(own)
-
-
 def _settings(
-    plan: str | Mapping[str, Any],
+    plan: Mapping[str, Any],
 ) -> list[tuple[tuple[tuple[str, str], ...], tuple[str, ...]]]:
-    """The settings of a method, and the options of each."""
-    if isinstance(plan, str):
-        return [((), tuple(shlex.split(plan)))]
+    """The settings of a method, and the options of each; without a grid there is one."""
     axes = [
         [
             (str(axis), str(value), shlex.split(options[value]) if named else [f"{axis}={value}"])
@@ -384,9 +372,13 @@ def _read_study(where: str, name: str, entry: object, tasks: Mapping[str, Task])
     for field in ("tasks", "also"):
         if isinstance(getattr(study, field), str):
             raise ValueError(f"{where}: {field} must be a list, got {getattr(study, field)!r}.")
+    if not isinstance(study.methods, Mapping):
+        raise ValueError(f"{where}: methods must be a mapping, got {study.methods!r}.")
+    plans = {m: {"options": p} if isinstance(p, str) else p for m, p in study.methods.items()}
     try:
         study = dataclasses.replace(
             study,
+            methods=plans,
             seeds=parse_seeds(study.seeds),
             tasks=tuple(study.tasks),
             also=tuple(study.also),
@@ -406,18 +398,18 @@ def _read_study(where: str, name: str, entry: object, tasks: Mapping[str, Task])
         if number is not None:
             _check_steps(where, number)
     for method, plan in study.methods.items():
-        if not isinstance(plan, str) and not {"options"} < set(plan) <= PLAN:
+        if not isinstance(plan, Mapping) or not {"options"} <= set(plan) <= PLAN:
             raise ValueError(
                 f"{where}: method {method} must be options of the script, or a mapping with "
                 f"options and grid, seeds or script, got {plan!r}."
             )
-        if not isinstance(plan, str) and "script" in plan:
+        if "script" in plan:
             _check_script(where, plan["script"])
-        if study.kind == "curves" and not isinstance(plan, str) and "grid" in plan:
+        if study.kind == "curves" and "grid" in plan:
             raise ValueError(
                 f"{where}: method {method} has a grid, which needs kind: ranking or heat_map."
             )
-        if study.kind == "heat_map" and (isinstance(plan, str) or len(plan["grid"]) != 2):
+        if study.kind == "heat_map" and len(plan.get("grid", ())) != 2:
             raise ValueError(f"{where}: a heat map needs a grid of two axes, method {method}.")
     return study
 

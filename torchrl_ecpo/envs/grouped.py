@@ -97,14 +97,11 @@ class GroupedEnv(SeededGroups):
         super().__init__(batch_size=torch.Size([num_groups, group_size]), device=copies.device)
         # Not a submodule: the state of the copies is not the state_dict's business.
         object.__setattr__(self, "copies", copies)
-        self._copy_specs()
-        self._begin()
-
-    def _copy_specs(self) -> None:
         for name in ("observation", "action", "state", "reward", "done"):
             # The copies are alike, and some specs cannot be unflattened.
-            spec = getattr(self.copies, f"full_{name}_spec")[0].expand(self.batch_size)
+            spec = getattr(copies, f"full_{name}_spec")[0].expand(self.batch_size)
             setattr(self, f"full_{name}_spec", spec)
+        self._begin()
 
     def _start(
         self,
