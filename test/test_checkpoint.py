@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -233,6 +234,19 @@ def contents(directory):
     """What is in all files, by name."""
     files = directory.rglob("*")
     return {str(file): file.read_bytes() if file.is_file() else None for file in files}
+
+
+@pytest.mark.parametrize("value", [np.mean([1, 2]), np.zeros(2), [{"a": np.int64(1)}]], ids=str)
+def test_what_could_not_be_read_is_not_written(tmp_path, value):
+    """As Python takes numpy's numbers for its own; the message comes before anything is lost."""
+    written = attach(tmp_path, net=torch.nn.Linear(1, 1))
+    written.progress.frames = 5
+    written.save()
+    written.progress.frames, written.progress.returns = 6, [value]
+    with pytest.raises(CheckpointError, match=r"state of Progress must be .*numpy.*\.item\(\)"):
+        written.save()
+    assert [path.name for path in checkpoints(tmp_path)] == ["checkpoint-000000000005"]
+    assert attach(tmp_path, "auto", net=torch.nn.Linear(1, 1)).step == 5
 
 
 def attach(directory, resume=None, keep=2, **parts):

@@ -18,6 +18,7 @@ from torchrl.data import (
     Composite,
     LazyTensorStorage,
     NonTensor,
+    ReplayBuffer,
     TensorDictReplayBuffer,
     Unbounded,
 )
@@ -29,6 +30,7 @@ from torchrl.envs import (
     RewardSum,
     StepCounter,
     TransformedEnv,
+    VecNormV2,
 )
 from torchrl.modules import (
     LSTMModule,
@@ -332,6 +334,14 @@ def test_entries_that_are_no_tensors_are_refused():
     env.observation_spec = spec
     with pytest.raises(TypeError, match=r"Only tensors .*'prompt'.*ExcludeTransform"):
         collect(env)
+
+
+@pytest.mark.filterwarnings("ignore:Support of VecNormV2:UserWarning")
+def test_running_statistics_are_refused():
+    """They would count the rows that wait for the longest."""
+    env = GroupedEnv(partial(GymEnv, "Pendulum-v1"), num_groups=1, group_size=3)
+    with pytest.raises(ValueError, match=r"VecNormV2 would count .*freeze\(\)"):
+        collect(TransformedEnv(env, VecNormV2(in_keys=["observation"])))
 
 
 def test_an_index_is_refused_where_one_hot_actions_are_read():
@@ -729,6 +739,21 @@ def test_workers_that_play_frames_number_their_own_trajectories():
     with shut_down(collector):
         ids = next(iter(collector))["collector", "traj_ids"].tolist()
     assert ids == [0] * 4 + [1] * 4
+
+
+def test_workers_that_play_frames_fill_a_buffer():
+    buffer = ReplayBuffer(storage=LazyTensorStorage(100), batch_size=4)
+    collector = SupervisedSyncCollector(
+        [partial(GymEnv, "Pendulum-v1")],
+        frames_per_batch=8,
+        total_frames=16,
+        replay_buffer=buffer,
+        postproc=lambda batch: batch.exclude("pixels", "observation"),
+    )
+    with shut_down(collector):
+        assert [*collector] == [None, None]
+    assert len(buffer) == 16
+    assert "observation" not in {*buffer.sample().keys()}
 
 
 def test_ray_workers():

@@ -8,6 +8,7 @@ import shutil
 
 import numpy as np
 import pytest
+import torch
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
@@ -243,7 +244,7 @@ def runs(tmp_path, monkeypatch):
     for method, values in curves.items():
         for seed, returns in enumerate(values):
             loss = {"name": method, "tau": 0.1 * (seed + 1)}
-            config = make_config(loss=loss, total_trajectories=30)
+            config = make_config(loss=loss, total_trajectories=30, seed=seed)
             with make_run(tmp_path / method / str(seed), config) as run:
                 for i, value in enumerate(returns):
                     run.log({"return": value}, step=10 * (i + 1))
@@ -373,6 +374,31 @@ def test_methods_are_told_apart_by_what_is_null_too(runs):
     found = find_runs([runs / "fixed", runs / "learned"])
     comparison = load_comparison(found, "return", by=["loss.name", "loss.target_kl"])
     assert set(comparison.curves) == {"ecac, loss.target_kl null", "ecac, loss.target_kl 0.1"}
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"seed": 1}, "ecpo has the seed 1 twice, in .*ecpo/1 and .*other.*--by"),
+        (
+            {"env": {"name": "reverse"}},
+            "ecpo has runs on several tasks, .*ecpo/0 and .*other.*--by",
+        ),
+    ],
+)
+def test_a_mean_is_of_runs_that_are_alike(runs, entries, message):
+    with make_run(runs / "other", make_config(**entries)) as run:
+        run.log({"return": 1.0}, step=10)
+    with pytest.raises(ValueError, match=message):
+        load_comparison(find_runs([runs]), "return")
+
+
+def test_steps_of_any_library_are_numbers_of_python(tmp_path):
+    with make_run(tmp_path) as run:
+        run.log({"return": 1.0}, step=np.int64(10))
+        run.log({"return": 2.0}, step=torch.tensor(20))
+    assert (tmp_path / "metrics.csv").read_text().split() == ["step,return", "10,1.0", "20,2.0"]
+    assert json.loads((tmp_path / "summary.json").read_text())["trajectories"] == 20
 
 
 def test_comparison_refuses_runs_that_cannot_be_compared(runs):

@@ -84,6 +84,15 @@ class TestPack:
         assert_close(pack_groups(unpack_groups(groups)), groups, rtol=0, atol=0)
         assert_close(pack_groups(groups.reshape(-1)), groups, rtol=0, atol=0)
 
+    @pytest.mark.parametrize("traj_ids", [True, False])
+    def test_what_a_sampler_pads_is_packed(self, traj_ids):
+        """Also a trajectory of one step, whose padding begins and ends at every step."""
+        steps = make_steps([(5, 1), (5, 3)], is_init=True, traj_ids=traj_ids)
+        padded = steps[torch.tensor([[0, 0, 0], [1, 2, 3]])]
+        assert pack_groups(padded)[MASK].sum(-1).tolist() == [[1, 3]]
+        with pytest.raises(ValueError, match="Rows hold several trajectories"):
+            pack_groups(steps[torch.tensor([[0, 1, 2]])])
+
     def test_interleaved_steps_of_any_kind(self):
         """Texts go with their step, and padding repeats the last one."""
         steps = make_steps([(1, 2), (0, 3), (1, 1), (0, 1)], is_init=True)

@@ -189,6 +189,9 @@ def test_wrong_learning_rates_are_refused():
     for rate in (-1, float("inf"), float("nan")):
         with pytest.raises(ValueError, match=rf"log_tau must be in \[0, inf\), got {rate}"):
             trainers.LearningRates(log_tau=rate)
+    torch.optim.lr_scheduler.LambdaLR(trainer.optimizer, lambda step: 1.0)
+    with pytest.raises(ValueError, match="register LearningRates before it is made"):
+        trainers.LearningRates(log_tau=0.1).register(trainer)
     trainer.optimizer = None
     with pytest.raises(ValueError, match="needs a trainer with an optimizer="):
         trainers.LearningRates(log_tau=0.1).register(trainer)

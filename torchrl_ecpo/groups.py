@@ -237,6 +237,7 @@ def _mask_from_done(steps: TensorDictBase, traj_key: NestedKey) -> Tensor:
     done = steps["done"]
     mask = done.cumsum(-1) - done.long() == 0
     second = steps.get("is_init", torch.zeros_like(done))
+    second = second & ~(done & done[..., :1])  # what repeats a single step, which begins and ends
     if "trajectory" in steps:
         # Padding has the trajectory's own id, or 0.
         ids = steps["trajectory"]

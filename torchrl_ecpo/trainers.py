@@ -63,7 +63,7 @@ class LearningRates(TrainerHookBase):
 
     Raises:
         ValueError: for a rate that is no finite number >= 0 and, when registered, for a name of
-            nothing that the loss learns, or without an optimiser.
+            nothing that the loss learns, without an optimiser, or after a learning-rate scheduler.
 
     Examples:
         >>> LearningRates(log_tau=1e-2, actor_network=1e-3).rates
@@ -81,6 +81,11 @@ class LearningRates(TrainerHookBase):
         optimizer = trainer.optimizer
         if optimizer is None:
             raise ValueError("LearningRates needs a trainer with an optimizer=, which it regroups.")
+        if any("initial_lr" in group for group in optimizer.param_groups):
+            raise ValueError(
+                "LearningRates adds groups of parameters, and a learning-rate scheduler has "
+                "counted those that there are: register LearningRates before it is made."
+            )
         learned: dict[str, list[Any]] = {}
         for parameter_name, parameter in trainer.loss_module.named_parameters():
             owner = parameter_name.split(".")[0].removesuffix("_params")

@@ -9,12 +9,14 @@ import gymnasium
 import numpy
 import pytest
 import torch
+from torch.testing import assert_close
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import (
     Compose,
     DMControlEnv,
     DoubleToFloat,
+    FrameSkipTransform,
     GymEnv,
     GymWrapper,
     InitTracker,
@@ -317,6 +319,25 @@ def test_episodes_of_other_environments_are_not_replayed():
         TypeError, match=r"one task of gymnasium or dm_control, got SerialEnv\. Put"
     ):
         env.reset()
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_episodes_of_unseen_steps_are_not_replayed(nested):
+    """Behind a transform that steps by itself; in front of it they are."""
+    replay, skip = EpisodeReplay(), FrameSkipTransform(3)
+    transform = Compose(skip, Compose(replay)) if nested else Compose(skip, replay)
+    with pytest.raises(TypeError, match=r"behind FrameSkipTransform, .* put it in front"):
+        TransformedEnv(GymEnv("Pendulum-v1"), transform).reset()
+    env, other = (
+        TransformedEnv(
+            GymEnv("Pendulum-v1"), Compose(EpisodeReplay(), FrameSkipTransform(3), StepCounter())
+        )
+        for _ in range(2)
+    )
+    state = env.rollout(3)[-1]["next"]
+    other.load_state_dict(env.state_dict())
+    after = [each.step(state.clone().set("action", torch.ones(1))) for each in (env, other)]
+    assert_close(after[0]["next", "observation"], after[1]["next", "observation"], rtol=0, atol=0)
 
 
 class Careless(gymnasium.Env):

@@ -149,6 +149,21 @@ def test_a_copy_that_is_over_is_left_alone(parallel):
     env.close(raise_if_closed=False)
 
 
+def test_a_reward_may_be_an_array_of_one_number():
+    class Boxed(Countdown):
+        def step(self, action):
+            observation, reward, *others = super().step(action)
+            return observation, np.array([reward]), *others
+
+    for kind in (Countdown, Boxed):
+        env = make_grouped_env(kind, **SIZES)
+        env.set_seed(1)
+        env.reset()
+        action = torch.zeros(2, 3, dtype=torch.int64)
+        reward = env.step(TensorDict(action=action, batch_size=[2, 3]))["next", "reward"]
+        assert reward.flatten().tolist() == [12.0] * 3 + [13.0] * 3
+
+
 def test_no_step_is_played_for_nothing():
     """Over a batch, copies are stepped as often as it has steps."""
     count = 0

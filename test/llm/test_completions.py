@@ -351,6 +351,12 @@ def test_a_model_that_the_wrapper_calls_wrongly():
         check_sampler(tiny.make_sampler(model))
 
 
+def test_a_compiled_model_is_looked_into():
+    sampler = tiny.make_sampler(tiny.make_model())
+    sampler.model = torch.compile(sampler.model)
+    check_sampler(sampler)
+
+
 def test_top_k_of_transformers():
     """Without top_k, transformers draws from 50 tokens: harmless where there are no more."""
     settings = {"do_sample": True}

@@ -322,6 +322,7 @@ def test_an_encoder_scales_bytes_and_keeps_any_batch():
     assert encoder.size == 2 * 1 * 32  # 20 becomes 10, 5, 3, 2 and 7 becomes 4, 2, 1, 1
     expected = encoder.convolutions(bytes_[1, 2].float() / 255)
     torch.testing.assert_close(features[1, 2], expected)
+    torch.testing.assert_close(encoder(bytes_ / 255), features)  # as ToTensorImage has them
 
 
 @pytest.mark.parametrize("observation_size", [3, (1, 9, 9)])

@@ -198,6 +198,24 @@ def test_batches_of_any_shape(case, shape, batch_size):
     assert_close(call(case.build(**LEARNED), shaped), call(case.build(**LEARNED), flat))
 
 
+def test_entries_that_are_not_read_may_be_of_any_shape():
+    flat = _batch()
+    loose = TensorDict({**flat.to_dict(), "extra": torch.zeros(7)}, batch_size=[])
+    assert_close(call(CASE.build(), loose), call(CASE.build(), flat))
+
+
+def test_a_locked_batch_has_room_for_priorities():
+    batch = _batch()
+    expected = batch.clone()
+    call(CASE.build(), expected)
+    locked = batch.clone().set("td_error", torch.zeros(*batch.shape, 1, dtype=torch.double)).lock_()
+    call(CASE.build(), locked)
+    assert_close(locked["td_error"].squeeze(-1), expected["td_error"])
+    small = batch.clone().set("td_error", torch.zeros(*batch.shape, 2, dtype=torch.double)).lock_()
+    with pytest.raises(ValueError, match=r"room for .* priorities 'td_error'.*unlock"):
+        call(CASE.build(), small)
+
+
 def test_single_numbers_may_be_observations_and_actions():
     """TensorDict takes the last axis of a call without a tensordict for one of the batch then."""
     networks = make_networks()

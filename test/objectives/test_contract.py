@@ -292,6 +292,8 @@ def test_schedule_by_assignment(case):
         assert name not in dict(loss.named_parameters())
         assert (buffer.item(), buffer.dtype, buffer.shape) == (2.0, torch.float64, torch.Size([]))
         assert not torch.allclose(loss(batch)["loss_actor"], before)
+        with pytest.raises(TypeError, match=rf"would not be trained: learn it by learn\('{name}'"):
+            setattr(loss, name, torch.nn.Parameter(torch.tensor(0.5)))
 
 
 # ------------------------------------------------------------------------------------- the targets

@@ -107,6 +107,23 @@ def test_the_policy_that_drew_the_batch_is_known_again(name, head, dtype, record
         assert PMDLoss(actor)(batch)["ESS"].item() == pytest.approx(K, abs=1e-4)
 
 
+@pytest.mark.parametrize("name", DISTRIBUTIONS)
+def test_another_action_than_was_drawn_is_evaluated_itself(name):
+    """As noise behind the policy makes it: the latent is then none of that action."""
+    actor = make_actor(DISTRIBUTIONS[name], 0.0, 0.0)
+    record_latents(actor)
+    batch = draw(actor)
+    span = batch["action"].amax() - batch["action"].amin()
+    other = batch.clone()
+    other["action"] = batch["action"].flip(2) * 0.9 + 0.1 * batch["action"].mean()
+    assert (other["action"] - batch["action"]).abs().amax() > 0.1 * span
+    expected = PMDLoss(actor)(other.exclude("action_latent"))
+    assert_close(PMDLoss(actor)(other), expected)
+    other["action"][0, 0, 0] = torch.nan
+    with pytest.raises(ValueError, match="NaN"):
+        PMDLoss(actor)(other)
+
+
 @pytest.mark.parametrize(("loc", "log_scale"), [(0.0, 0.0), (8.0, 0.0), (0.0, 2.0)])
 @pytest.mark.parametrize("name", DISTRIBUTIONS)
 def test_gradients_are_those_of_the_latent_gaussian(name, loc, log_scale):

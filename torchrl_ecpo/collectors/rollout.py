@@ -19,6 +19,8 @@ from torchrl.envs import (
     EnvBase,
     InitTracker,
     TransformedEnv,
+    VecNorm,
+    VecNormV2,
 )
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import (
@@ -108,6 +110,12 @@ class GroupPlayer:
             )
         if "done" not in env.done_keys:
             raise KeyError(f"The environment must have one 'done' a row, it has {env.done_keys}.")
+        for module in env.modules():
+            if isinstance(module, (VecNorm, VecNormV2)) and not getattr(module, "frozen", False):
+                raise ValueError(
+                    f"{type(module).__name__} would count trajectories that have ended, which wait "
+                    "for the longest. Let it see one environment alone, and freeze() it."
+                )
         texts = [key for key, spec in specs.items() if isinstance(spec, NonTensor)]
         if texts:
             raise TypeError(

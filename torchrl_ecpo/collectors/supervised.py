@@ -9,6 +9,7 @@ from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import BaseCollector, Collector
+from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
 from torchrl_ecpo.checks import check_count, check_kind
@@ -37,6 +38,8 @@ class SupervisedSyncCollector(PlayerCollector):
         frames_per_batch: `B`, of which the workers play equal shares.
         total_frames: stop when this many have been collected. Default: -1, never.
         init_random_frames: how many actions are random at first, over all workers. Default: 0.
+        postproc: called with each batch, in this process. Default: None.
+        replay_buffer: extended by each batch, in place of which None is yielded. Default: None.
         options: what else ``Collector`` takes.
 
     Raises:
@@ -63,10 +66,12 @@ class SupervisedSyncCollector(PlayerCollector):
         frames_per_batch: int,
         total_frames: int = -1,
         init_random_frames: int = 0,
+        postproc: Callable[[Any], Any] | None = None,
+        replay_buffer: ReplayBuffer | None = None,
         **options: Any,
     ) -> None:
         """Start the workers; the class describes the arguments."""
-        super().__init__(policy, total_frames)
+        super().__init__(policy, total_frames, postproc, replay_buffer)
         frames_per_batch = check_count("frames_per_batch", frames_per_batch)
         init_random_frames = check_count("init_random_frames", init_random_frames, least=0)
         check_kind("create_env_fn", create_env_fn, Sequence)

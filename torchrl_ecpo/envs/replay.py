@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import json
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import DMControlWrapper, GymWrapper, Transform
+from torchrl.envs import (
+    BurnInTransform,
+    DMControlWrapper,
+    FrameSkipTransform,
+    GymWrapper,
+    NoopResetEnv,
+    Transform,
+)
 
 from torchrl_ecpo.checks import check_flag, check_kind
 from torchrl_ecpo.envs._groups import check_owner, describe
+
+STEPPERS = (BurnInTransform, FrameSkipTransform, NoopResetEnv)
+"""Transforms that step an environment by themselves."""
 
 
 class EpisodeReplay(Transform):
@@ -27,7 +38,8 @@ class EpisodeReplay(Transform):
     the tensordict that the caller holds.
 
     Raises:
-        TypeError: if it is not on one task of gymnasium or dm_control.
+        TypeError: if it is not on one task of gymnasium or dm_control, or behind a transform that
+            steps by itself.
         ValueError: for the state of another environment.
 
     Examples:
@@ -107,6 +119,13 @@ class EpisodeReplay(Transform):
                 "EpisodeReplay is a transform of one task of gymnasium or dm_control, got "
                 f"{type(env).__name__}. Put it on each copy: TransformedEnv(GymEnv(...), "
                 "EpisodeReplay())."
+            )
+        container: Any = self.container
+        before = takewhile(lambda each: each is not self, container.transform.modules())
+        if steppers := [type(each).__name__ for each in before if isinstance(each, STEPPERS)]:
+            raise TypeError(
+                f"EpisodeReplay stands behind {steppers[0]}, whose own steps it does not see: put "
+                "it in front."
             )
         return env
 

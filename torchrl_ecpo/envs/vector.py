@@ -235,6 +235,7 @@ class _Copy(gym.Wrapper):
         if action is None:
             return self._seen, 0.0, False, False, {}
         self._seen, reward, terminated, truncated, _ = self.env.step(action)
+        reward = np.asarray(reward).item()  # of an array of one number, too
         is_over = terminated or truncated
         ends = {"terminated": bool(terminated), "truncated": bool(truncated)} if is_over else {}
         return self._seen, reward, False, False, ends

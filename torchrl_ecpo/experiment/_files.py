@@ -22,6 +22,18 @@ class StateFile(StateDictCheckpointAdapter):
     def __init__(self) -> None:
         super().__init__("torch")
 
+    def save(self, component: Any, path: Path, **options: Any) -> Any:
+        """Write a component; refuse what could not be read."""
+        state = super().save(component, path, **options)
+        strange = torch.serialization.get_unsafe_globals_in_checkpoint(path / self.state_torch)
+        if strange:
+            raise TypeError(
+                f"the state of {type(component).__name__} must be tensors, numbers, texts and "
+                f"containers of these, got what needs {', '.join(sorted(strange))}: make numpy's "
+                "numbers Python's own by .item(), and its arrays tensors"
+            )
+        return state
+
     def load(self, component: Any, path: Path, **_: Any) -> None:
         """Restore a component."""
         component.load_state_dict(torch.load(path / self.state_torch, weights_only=True))

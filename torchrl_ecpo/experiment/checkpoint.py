@@ -151,26 +151,27 @@ class Checkpoints:
             CheckpointError: if the checkpoint is damaged.
         """
         self.run, self.progress, self.parts = run, progress, parts
+        self._saved_step: int | None = self.step
         self.checkpoint = Checkpoint()
         parts = {"run": run, "progress": progress, "random": GlobalRNGState(), **parts}
         for name, part in parts.items():
             if part is not None:
                 self.checkpoint.register(name, part, adapter=StateFile())
-        check_count(f"progress.{run.unit}", self.step, least=0)
         if self.source is None:
-            self._remove(
-                _paths(self.folder)
-            )  # of a run that was here before, whose record will be gone
+            # Of a run that was here before, whose record will be gone.
+            self._remove(_paths(self.folder))
+            self._saved_step = None
         else:
             self._load(self.source)
-        self._saved_step = self.step if self.source is not None else None
+            self._saved_step = self.step
         self._saved_at, self._pause = time.monotonic(), 0.0
         return self
 
     @property
     def step(self) -> int:
         """Where the run stands, in its unit."""
-        return getattr(self.progress, self.run.unit)
+        unit = self.run.unit
+        return check_count(f"progress.{unit}", getattr(self.progress, unit), least=0)
 
     def _load(self, source: Path) -> None:
         metadata = self._saved
@@ -231,7 +232,7 @@ class Checkpoints:
             seal(written)
             written.rename(path)
             self._remove(_paths(self.folder)[: -1 if finished else -self.options.keep])
-        except (OSError, RuntimeError) as error:
+        except (OSError, RuntimeError, TypeError) as error:
             shutil.rmtree(written, ignore_errors=True)
             raise CheckpointError(
                 f"The checkpoint at {self.run.unit} {self.step} could not be written: {error}. "

@@ -12,11 +12,13 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from omegaconf import OmegaConf
 
 from torchrl_ecpo.experiment.figures import plot_comparison, smooth
+from torchrl_ecpo.experiment.options import flatten
 from torchrl_ecpo.experiment.run import METRICS_FILE, read_metrics
 
 __all__ = ["Comparison", "align", "area", "final", "find_runs", "load_comparison", "main"]
@@ -137,17 +139,21 @@ def load_comparison(
     Raises:
         FileNotFoundError: if a run has no ``config.yaml``.
         KeyError: if a run has no such metric or entry.
-        ValueError: if a run has no value yet, or the runs of a method do not overlap.
+        ValueError: if a run has no value yet, if the runs of a method do not overlap, are of
+            several tasks, or have a seed twice.
     """
     if metric is None:
         measured = read_metrics(runs[0])
         metric = next((name for name in DEFAULT_METRICS if name in measured), DEFAULT_METRICS[-1])
     curves: dict[str, list[np.ndarray]] = {}
+    known: dict[str, dict[Any, Path]] = {}  # by method, the run of each seed
     for run in runs:
         columns = read_metrics(run)
         if metric not in [*columns]:
             raise KeyError(f"{run} has no metric {metric!r}; it has {sorted(columns)}.")
-        method = _method(run, by)
+        config = _config(run)
+        method = _method(run, config, by)
+        _check_alike(method, known.setdefault(method, {}), run, config)
         steps, values = np.array(columns["step"]), np.array(columns[metric])
         measured = ~np.isnan(values)
         if not measured.any():
@@ -185,10 +191,36 @@ def align(curves: Sequence[np.ndarray], method: str) -> Curve:
     return steps, np.stack(values)
 
 
-def _method(run: Path, by: Sequence[str]) -> str:
+def _config(run: Path) -> Any:
     if not (run / "config.yaml").is_file():
         raise FileNotFoundError(f"There is no config.yaml in {run}: is it the directory of a run?")
-    config = OmegaConf.load(run / "config.yaml")
+    return OmegaConf.load(run / "config.yaml")
+
+
+def _check_alike(method: str, known: dict[Any, Path], run: Path, config: Any) -> None:
+    """Refuse the mean of runs that are not of one method: on another task, or with a seed twice."""
+    first = next(iter(known.values()), run)
+    if _task(config) != _task(_config(first)):
+        raise ValueError(
+            f"{method} has runs on several tasks, {first} and {run}. Compare one task at a time, "
+            "or name what tells them apart: --by loss.name env.name."
+        )
+    seed = OmegaConf.select(config, "seed")
+    if seed is not None and seed in known:
+        raise ValueError(
+            f"{method} has the seed {seed} twice, in {known[seed]} and {run}. Leave one out, or "
+            "name the options that tell the runs apart: --by loss.name optim.lr."
+        )
+    known[seed] = run
+
+
+def _task(config: Any) -> dict[str, Any]:
+    """What says which task a run is on, but for the problem instances, which may be a seed's."""
+    entries = flatten({"env": OmegaConf.select(config, "env")})
+    return {name: value for name, value in entries.items() if not name.endswith("seed")}
+
+
+def _method(run: Path, config: Any, by: Sequence[str]) -> str:
     absent = object()
     values = [OmegaConf.select(config, entry, default=absent) for entry in by]
     if absent in values:

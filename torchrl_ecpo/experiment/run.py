@@ -20,6 +20,7 @@ from functools import wraps
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from filelock import BaseFileLock, FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
@@ -84,8 +85,7 @@ class MetricsTable:
             ValueError: if the step is not beyond that of the row before, if a metric is called
                 step, or if anything is no number.
         """
-        if not math.isfinite(as_float("step", step)):
-            raise ValueError(f"step must be finite, got {step}.")
+        step = _as_step(step)
         if self.rows and not step > self.rows[-1]["step"]:
             raise ValueError(f"step must grow, got {step} after {self.rows[-1]['step']}.")
         self.restore()
@@ -292,6 +292,7 @@ class Run:
         Raises:
             FloatingPointError: as :meth:`check`; what was recorded stays.
         """
+        step = _as_step(step)
         values = {str(name): float(value) for name, value in metrics.items()}
         # One that is there is of a shorter run before this one.
         (self.directory / "summary.json").unlink(missing_ok=True)
@@ -371,6 +372,13 @@ class Run:
         )
         if picture is not None:
             print(f"{self.name}: learning curve in {picture}")
+
+
+def _as_step(step: Any) -> Any:
+    """A step as Python's own number, which json writes; refuse what is none."""
+    if not math.isfinite(as_float("step", step)):
+        raise ValueError(f"step must be finite, got {step}.")
+    return step.item() if isinstance(step, (Tensor, np.generic)) else step
 
 
 def command_line() -> list[str]:

@@ -117,10 +117,12 @@ def check_sampler(sampler: Any) -> None:
 
 def _check_arguments(model: Any) -> None:
     """Refuse a model whose attention mask TorchRL's wrapper would pass for something else."""
-    second = [*inspect.signature(model.forward).parameters][1:2]
-    if second not in ([], ["attention_mask"], ["args"]):
+    model = getattr(model, "_orig_mod", model)  # which torch.compile wraps
+    second = [*inspect.signature(model.forward).parameters.values()][1:2]
+    named = [one.name for one in second if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)]
+    if named not in ([], ["attention_mask"]):
         raise ValueError(
-            f"{type(model).__name__}.forward takes {second[0]} where TorchRL's wrapper passes the "
+            f"{type(model).__name__}.forward takes {named[0]} where TorchRL's wrapper passes the "
             "attention mask, second. Take a model that has its mask there, as Llama, Qwen, OPT and "
             "GPT-NeoX have it."
         )

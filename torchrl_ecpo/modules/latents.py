@@ -139,6 +139,24 @@ def invert(distribution: Distribution, action: Tensor) -> Tensor:
     return action
 
 
+def latent_of(distribution: Distribution, action: Tensor, recorded: Tensor | None) -> Tensor:
+    """The latent of an action: the recorded one where it makes that action, or else by inversion.
+
+    Noise that is added behind the policy makes another one.
+    """
+    latent = invert(distribution, action)
+    if recorded is None:
+        return latent
+    made = recorded
+    for transform in split(distribution)[1]:
+        made = transform(made)
+    if made.shape != action.shape:
+        return recorded
+    eps = max(torch.finfo(x.dtype).eps for x in (action, recorded))
+    is_same = (made - action).abs() <= 64 * eps * action.abs().amax()
+    return recorded.where(is_same, latent.to(recorded.dtype))
+
+
 def _each(transforms: list[Any]) -> Iterator[Any]:
     """Every single one."""
     for transform in transforms:

@@ -15,7 +15,7 @@ CHANNELS = (16, 32, 32, 32)
 
 
 class PixelEncoder(nn.Module):
-    """A small convolutional network over images of bytes, which it scales to [0, 1].
+    """A small convolutional network over images: bytes, which it scales, or numbers from 0 to 1.
 
     Four convolutions of 3 x 3 pixels with a stride of 2, and ELU, TorchRL's: 96 x 96 pixels become
     6 x 6 x 32 numbers.
@@ -49,5 +49,5 @@ class PixelEncoder(nn.Module):
         self.size = CHANNELS[-1] * math.prod(math.ceil(side / halvings) for side in sides)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """From ``[..., C, H, W]`` bytes to ``[..., size]``."""
-        return self.convolutions(pixels / 255)
+        """From ``[..., C, H, W]`` to ``[..., size]``."""
+        return self.convolutions(pixels if pixels.is_floating_point() else pixels / 255)

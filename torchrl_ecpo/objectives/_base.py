@@ -117,6 +117,11 @@ class PolicyLoss(LossModule):
         if name not in buffers:
             super().__setattr__(name, value)
             return
+        if isinstance(value, Tensor) and value.requires_grad:
+            raise TypeError(
+                f"{name} is set to its present number, and would not be trained: learn it by "
+                f"learn({name!r}, start), or set value.item()."
+            )
         buffers[name].fill_(self.allowed_temperatures(**{name: as_float(name, value)})[name])
 
     def _refuse_learned(self, name: str) -> None:

@@ -346,8 +346,13 @@ class ActorCriticLoss(PolicyLoss):
         key = self.tensor_keys.priority
         if not tensordict.is_locked:
             tensordict.set(key, priority)
-        elif tensordict.get(key, None) is not None:
-            tensordict.set_(key, priority)
+        elif (entry := tensordict.get(key, None)) is not None:
+            if entry.numel() != priority.numel():
+                raise ValueError(
+                    f"The locked batch has room for {list(entry.shape)} priorities {key!r}, which "
+                    f"are {list(priority.shape)}: leave it out, or unlock the batch."
+                )
+            tensordict.set_(key, priority.reshape(entry.shape))
         return self._selected(outputs, transitions.shape)
 
     def _outputs(
@@ -757,7 +762,10 @@ class ActorCriticLoss(PolicyLoss):
         def only_real(entry: Tensor) -> Tensor:
             return entry if mask is None else _blank(entry, ~mask)
 
-        transitions: Any = tensordict.apply(only_real, batch_size=shape)
+        several_steps = self.value_estimator.tensor_keys.steps_to_next_obs
+        further = (self.tensor_keys.priority_weight, several_steps)
+        read = tensordict.select(*self._all_in_keys, *further, strict=False)
+        transitions: Any = read.apply(only_real, batch_size=shape)
         return transitions, mask
 
     def _priority_weights(self, tensordict: TensorDictBase, mask: Tensor | None) -> Tensor | None:

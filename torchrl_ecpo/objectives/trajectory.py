@@ -46,9 +46,9 @@ from torchrl_ecpo.groups import DONE_KEY, GROUP_KEY
 from torchrl_ecpo.llm.completions import check_actor, is_language_model, read_completions
 from torchrl_ecpo.modules.distinct import take_rows
 from torchrl_ecpo.modules.latents import (
-    invert,
     is_lost,
     latent_key,
+    latent_of,
     log_prob_of_latent,
     may_squash,
     parts_of,
@@ -144,8 +144,9 @@ class TrajectoryGroupLoss(PolicyLoss):
     A squashed action (``TanhNormal``, any ``TransformedDistribution``) is evaluated at the latent
     that was drawn, where that is recorded: ``"action_latent"`` for ``"action"``, as
     :func:`~torchrl_ecpo.modules.record_latents` lets a policy write it and the package's collector
-    does. Otherwise the transform is inverted, which near the ends of the range, and in half
-    precision everywhere, gives another latent. Where the distribution's parameters are recorded
+    does. Otherwise, and where noise behind the policy has made another action of it, the transform
+    is inverted, which near the ends of the range, and in half precision everywhere, gives another
+    latent. Where the distribution's parameters are recorded
     beside the action (an actor writes them), the policy that drew it is then evaluated at that
     latent too, so that its ratio to itself is 1; the gradient is not that of the latent.
 
@@ -694,10 +695,8 @@ def _log_prob_of_part(distribution: Any, inputs: TensorDictBase, key: NestedKey)
         check_integers(key, action)
     if not split(distribution)[1]:
         return distribution.log_prob(action)
-    latent = inputs.get(latent_key(key), None)
-    return log_prob_of_latent(
-        distribution, invert(distribution, action) if latent is None else latent
-    )
+    recorded = inputs.get(latent_key(key), None)
+    return log_prob_of_latent(distribution, latent_of(distribution, action, recorded))
 
 
 def _steps_of(module: Any) -> Iterator[Any]:
