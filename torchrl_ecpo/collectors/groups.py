@@ -104,7 +104,8 @@ class TrajectoryGroupCollector(PlayerCollector):
         TypeError: for an argument that does not go with groups or is of another class, and for an
             environment that writes anything but tensors.
         ValueError: if `K` is below 2 or not the environment's, if `G` is no multiple, or if the
-            environment makes groups of another size.
+            environment makes groups of another size; for a ``VecNorm`` that is not frozen, which
+            would count ended trajectories.
         KeyError: if the environment has no `group_key`.
         RuntimeError: if a trajectory does not end within `max_steps`.
         ChildProcessError: if a worker dies.

@@ -151,6 +151,7 @@ class Checkpoints:
             CheckpointError: if the checkpoint is damaged.
         """
         self.run, self.progress, self.parts = run, progress, parts
+        # What is no count is refused here, before anything is removed.
         self._saved_step: int | None = self.step
         self.checkpoint = Checkpoint()
         parts = {"run": run, "progress": progress, "random": GlobalRNGState(), **parts}

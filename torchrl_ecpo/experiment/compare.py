@@ -146,20 +146,22 @@ def load_comparison(
         measured = read_metrics(runs[0])
         metric = next((name for name in DEFAULT_METRICS if name in measured), DEFAULT_METRICS[-1])
     curves: dict[str, list[np.ndarray]] = {}
-    known: dict[str, dict[Any, Path]] = {}  # by method, the run of each seed
+    members: dict[str, list[tuple[Path, Any]]] = {}  # by method, runs and their configurations
     for run in runs:
         columns = read_metrics(run)
         if metric not in [*columns]:
             raise KeyError(f"{run} has no metric {metric!r}; it has {sorted(columns)}.")
         config = _config(run)
         method = _method(run, config, by)
-        _check_alike(method, known.setdefault(method, {}), run, config)
+        members.setdefault(method, []).append((run, config))
         steps, values = np.array(columns["step"]), np.array(columns[metric])
         measured = ~np.isnan(values)
         if not measured.any():
             raise ValueError(f"{run} has no value of {metric!r} yet: leave it out, or wait.")
         values = smooth(values[measured], smoothing)
         curves.setdefault(method, []).append(np.stack([steps[measured], values], axis=1))
+    for method, own in members.items():
+        _check_alike(method, own)
     return Comparison(metric, {method: align(curves[method], method) for method in curves})
 
 
@@ -197,21 +199,24 @@ def _config(run: Path) -> Any:
     return OmegaConf.load(run / "config.yaml")
 
 
-def _check_alike(method: str, known: dict[Any, Path], run: Path, config: Any) -> None:
+def _check_alike(method: str, members: Sequence[tuple[Path, Any]]) -> None:
     """Refuse the mean of runs that are not of one method: on another task, or with a seed twice."""
-    first = next(iter(known.values()), run)
-    if _task(config) != _task(_config(first)):
-        raise ValueError(
-            f"{method} has runs on several tasks, {first} and {run}. Compare one task at a time, "
-            "or name what tells them apart: --by loss.name env.name."
-        )
-    seed = OmegaConf.select(config, "seed")
-    if seed is not None and seed in known:
-        raise ValueError(
-            f"{method} has the seed {seed} twice, in {known[seed]} and {run}. Leave one out, or "
-            "name the options that tell the runs apart: --by loss.name optim.lr."
-        )
-    known[seed] = run
+    first, config = members[0]
+    task = _task(config)
+    by_seed: dict[Any, Path] = {}
+    for run, config in members:
+        if _task(config) != task:
+            raise ValueError(
+                f"{method} has runs on several tasks, {first} and {run}. Compare one task at a "
+                "time, or name what tells them apart: --by loss.name env.name."
+            )
+        seed = OmegaConf.select(config, "seed")
+        if seed is not None and seed in by_seed:
+            raise ValueError(
+                f"{method} has the seed {seed} twice, in {by_seed[seed]} and {run}. Leave one out, "
+                "or name the options that tell the runs apart: --by loss.name optim.lr."
+            )
+        by_seed[seed] = run
 
 
 def _task(config: Any) -> dict[str, Any]:

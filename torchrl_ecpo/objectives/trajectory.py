@@ -146,9 +146,9 @@ class TrajectoryGroupLoss(PolicyLoss):
     :func:`~torchrl_ecpo.modules.record_latents` lets a policy write it and the package's collector
     does. Otherwise, and where noise behind the policy has made another action of it, the transform
     is inverted, which near the ends of the range, and in half precision everywhere, gives another
-    latent. Where the distribution's parameters are recorded
-    beside the action (an actor writes them), the policy that drew it is then evaluated at that
-    latent too, so that its ratio to itself is 1; the gradient is not that of the latent.
+    latent. Where the distribution's parameters are recorded beside the action (an actor writes
+    them), the policy that drew it is then evaluated at that latent too, so that its ratio to itself
+    is 1; the gradient is not that of the latent.
 
     Args:
         actor_network: a policy with ``get_dist``: feed-forward or recurrent (it is called in
