@@ -62,7 +62,7 @@ FRAMES = 200
 def configure(overrides: list[str]) -> DictConfig:
     """The script's configuration."""
     with initialize_config_dir(str(SCRIPT / "config"), version_base="1.3"):
-        frames = ["total_frames=-1", "collector.init_random_frames=0"]
+        frames = ["total_frames=1000000000", "collector.init_random_frames=0"]
         return compose("config", ["env=halfcheetah", *frames, *overrides])
 
 
@@ -116,12 +116,12 @@ def step(optimizer: torch.optim.Optimizer, losses: TensorDictBase) -> None:
     descend(total(losses, is_policy_due=True), optimizer)
 
 
-def update(config: DictConfig, *, is_compiled: bool = False) -> Iteration:
+def update(config: DictConfig) -> Iteration:
     """Updates on one random batch, of which the loss gets a fresh copy as from a buffer."""
     env, _, loss_module, updater, optimizer = make_parts(config)
     batch = random_batch(env.fake_tensordict(), config.replay_buffer.batch_size)
     batch = batch.select(*loss_module.in_keys)
-    if is_compiled:
+    if config.compile:
         compile_module(loss_module, "update")
 
     def iterate() -> int:

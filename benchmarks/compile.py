@@ -23,13 +23,13 @@ def main() -> None:
     arguments = read_arguments(__doc__, losses=["sac", "ecac"], repeats=10)
     table = []
     for loss in arguments.losses:
-        config = configure([f"loss={loss}"])
-        compiled = update(config, is_compiled=True)
+        options = [f"loss={loss}"]
+        compiled = update(configure([*options, "compile=true"]))
         with fresh_cache():
             started = time.perf_counter()
             compiled()
             warm_up = time.perf_counter() - started
-            eager = update(config)
+            eager = update(configure(options))
             times, _, _ = take_turns([eager, compiled], arguments.repeats)
         eager_ms, compiled_ms = (time / NUM_UPDATES for time in times)
         row = {"loss": loss, "eager_ms": eager_ms, "compiled_ms": compiled_ms}

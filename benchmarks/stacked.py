@@ -79,7 +79,9 @@ def single_run(env: str, level: int | None) -> Iteration:
 
 def stacked_runs(env: str, level: int | None, number: int) -> Iteration:
     """One iteration of a stack."""
-    configs = {f"seed_{seed}": compose_run(env, level, seed) for seed in range(number)}
+    # A directory for each stack: stacks that take turns in one would each write its files anew.
+    names = {seed: f"{env}_{level}_stack_of_{number}_seed_{seed}" for seed in range(number)}
+    configs = {name: compose_run(env, level, seed) for seed, name in names.items()}
     stack = Stack(configs)
     for member in stack.members:
         lengthen(member.task, level)

@@ -53,6 +53,9 @@ STATED_FOR = {
     "Humanoid-v5": (ECAC_CONFIG, MUJOCO_TASKS[-1:]),
     **dict.fromkeys(("GRPO", "RLOO", "TPO", "Squared-PMD", "REPS"), (ECPO_CONFIG, ("copy",))),
     **dict.fromkeys(("PMD-AC", "SAC", "TD3", "DDPG"), (ECAC_CONFIG, MUJOCO_TASKS)),
+    **dict.fromkeys(
+        ("Discrete-ECAC", "Discrete-PMD-AC", "Discrete-SAC"), (ECAC_CONFIG, ("minatar",))
+    ),
 }
 
 FENCED = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
@@ -192,7 +195,7 @@ def test_stated_defaults_are_those_of_the_configuration(page):
 
 
 def test_the_settings_that_the_search_chose_are_those_of_the_configuration():
-    text = (DOCS / "algorithms/index.md").read_text()
+    text = (DOCS / "hyperparameters.md").read_text()
     optimisers = dict(re.findall(r"\*\*(\w+)\*\*: .*`(optim\.amsgrad=\S+ optim\.eps=\S+)`", text))
     assert set(optimisers) == {"batch", "group"}
     losses, cell = ("ecpo", "pmd", "pmd_entropy", "urex", "ment"), r" \| `(\S+)`"

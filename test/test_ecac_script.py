@@ -27,7 +27,7 @@ from torchrl.data import Bounded
 from torchrl.envs import GymEnv, GymWrapper
 from torchrl.objectives import SACLoss
 
-from torchrl_ecpo.experiment import read_metrics
+from torchrl_ecpo.experiment import compile_module, read_metrics
 from torchrl_ecpo.experiment._videos import greedy_episodes
 from torchrl_ecpo.modules import DenseNetwork
 
@@ -517,6 +517,17 @@ def test_a_compiled_update_that_leaves_the_policy_leaves_it(utils, build):
     moved = [not torch.equal(a[0], b[0]) for a, b in itertools.pairwise(policies)]
     assert moved == [True, False, True]
     torch.testing.assert_close(weights(is_compiled=True), policies, rtol=0, atol=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("loss", ["ecac", "sac", "crossq"])
+def test_an_update_is_compiled_once(build, loss):
+    """Without vmap TorchRL's losses are compiled at each call, until dynamo gives up."""
+    *_, loss_module = build(f"loss={loss}", "compile=true")
+    compile_module(loss_module, "update")
+    loss_module(random_transitions())
+    with torch.compiler.set_stance("fail_on_recompile"):
+        loss_module(random_transitions())
 
 
 def test_adam_has_a_group_for_each_learning_rate(utils, build):

@@ -387,7 +387,8 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
         done_key: the end of a trajectory.
 
     .. note:: The buffer's ``batch_size`` counts trajectories: `G * K`. (TorchRL's ``SliceSampler``
-       counts steps, its ``PromptGroupSampler`` rows.)
+       counts steps, its ``PromptGroupSampler`` rows.) ``ReplayBufferEnsemble``, which counts rows,
+       cannot draw groups: draw from each of its buffers.
 
     Raises:
         ValueError: if `group_size` is below 2, the batch size is not `G * K`, the storage or what

@@ -20,7 +20,7 @@ class Renorm(BatchRenorm1d):
     def forward(self, x: Tensor) -> Tensor:
         """Normalise the units of a batch."""
         outputs = super().forward(x)
-        self.num_batches_tracked.clamp_(max=self.warmup_steps)
+        self.num_batches_tracked.copy_(self.num_batches_tracked.clamp(max=self.warmup_steps))
         return outputs
 
 

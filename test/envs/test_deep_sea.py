@@ -61,6 +61,13 @@ def test_copies_that_are_not_reset_stay_where_they_are():
     assert env.reset(td)["observation"].tolist() == [[0, before[0, 1]]]
 
 
+def test_episodes_follow_each_other():
+    """TorchRL's resets within a rollout know which copies are over, and nothing else."""
+    env = DeepSeaEnv(3, group_size=2)
+    cells = env.rollout(8, break_when_any_done=False)["observation"]
+    assert (cells == 0).nonzero()[:, -1].tolist() == 2 * [0, 3, 6]
+
+
 @pytest.mark.parametrize(("key", "value"), [("action", 2), ("observation", 10), ("action", -1)])
 def test_what_does_not_exist_is_refused(key, value):
     env = DeepSeaEnv(3, group_size=2)

@@ -15,6 +15,7 @@ from tensordict.nn import (
 from torch import Tensor
 from torch.distributions import Categorical
 from torch.testing import assert_close
+from torchrl.data import MultiStep
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import HardUpdate, SoftUpdate
 from trajectory_problems import (
@@ -673,6 +674,10 @@ BAD_BATCHES = {
     "NaN observation": (
         *(_poke("observation", torch.nan), ValueError),
         r"of the entries \['action'\], given \['observation'\], under.* is NaN or infinite in 1",
+    ),
+    "rewards of several steps": (
+        lambda b: MultiStep(gamma=1.0, n_steps=2)(b),
+        *(ValueError, r"\('next', 'reward'\) are sums over up to 2 steps.*Leave MultiStep"),
     ),
     "log-prob with a trailing dimension": (
         *(_set("action_log_prob", lambda x: x.unsqueeze(-1)), ValueError),

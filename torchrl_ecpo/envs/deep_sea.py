@@ -63,11 +63,7 @@ class DeepSeaEnv(OneInstance):
         self._set_specs(Categorical(self.size**2 + 1, shape=self.batch_size), 2)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
-        start = torch.zeros(self.batch_size, dtype=torch.int64, device=self.device)
-        if tensordict is None or "_reset" not in tensordict:
-            return self._output(start)
-        is_reset = tensordict["_reset"].reshape(self.batch_size)
-        return self._output(start.where(is_reset, tensordict["observation"]))
+        return self._output(torch.zeros(self.batch_size, dtype=torch.int64, device=self.device))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         size, shape = self.size, self.batch_size

@@ -46,9 +46,9 @@ class ECPOLoss(LiftProjectLoss):
             far as the scores do (:func:`~torchrl_ecpo.functional.matched_temperature`); one
             tau_prime then serves short and long trajectories, early and late. Needs scores in
             deviations: ``score="group"`` or ``"batch"``.
-        control_variate: if True, the self-normalised ratios pi_theta/pi_bar are subtracted from
-            the weights, which removes the drift of groups without a preference. Defaults to False
-            (the paper).
+        control_variate: if True, the self-normalised ratios of pi_theta to the policy that drew the
+            trajectories are subtracted from the weights, which removes the drift of groups without
+            a preference. Defaults to False (the paper).
         score: see :class:`TrajectoryGroupLoss`. Defaults to ``"return"``.
         delay_actor: if True, the reference policy is the loss's own delayed copy of the actor, see
             :class:`TrajectoryGroupLoss`. Defaults to False: the recorded log-probability is the

@@ -17,8 +17,8 @@ class PMDLoss(LiftProjectLoss):
         - \tau' H(\pi_\theta) = (\tau + \tau') D_{KL}(\pi_\theta \| \bar\pi^*) + const
 
     by self-normalised importance sampling from the reference policy. ``tau_prime = 0`` is PMD,
-    ``tau_prime > 0`` the paper's PMD+entropy. At pi = pi_bar it is REINFORCE with the group's mean
-    as baseline.
+    ``tau_prime > 0`` the paper's PMD+entropy. At pi = pi_bar and tau_prime = 0 it is REINFORCE
+    with the group's mean as baseline.
 
     Args:
         actor_network: a policy with ``get_dist``, see :class:`TrajectoryGroupLoss`.

@@ -411,6 +411,7 @@ class TrajectoryGroupLoss(PolicyLoss):
             if mask is not None:
                 check_padding(self.mask_keys, mask)
                 self._check_left(self.mask_keys, mask)
+            self._check_single_steps(tensordict)
         check_group_size(shape[-2], f"K of the batch [*G, K, T] = {tuple(shape)}")
 
         def real(values: Tensor) -> Tensor:
@@ -440,6 +441,16 @@ class TrajectoryGroupLoss(PolicyLoss):
             )
         rewards = real(reward.squeeze(-1).to(log_prob.dtype))
         return Steps(rewards, log_prob, reference, behaviour, mask, inputs)
+
+    def _check_single_steps(self, tensordict: TensorDictBase) -> None:
+        """Refuse rewards that multi-step transforms have summed: a return sums them again."""
+        steps = tensordict.get("steps_to_next_obs", None)
+        if steps is not None and (steps > 1).any():
+            raise ValueError(
+                f"The rewards {self._reward_key!r} are sums over up to {int(steps.max())} steps "
+                "('steps_to_next_obs'), and a return would count each reward several times. Leave "
+                "MultiStep and MultiStepTransform out: a group is compared by whole trajectories."
+            )
 
     def _actor_inputs(
         self, tensordict: TensorDictBase, shape: torch.Size, step_mask: Tensor | None
