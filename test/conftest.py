@@ -11,6 +11,7 @@ import pytest
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
+from torch import multiprocessing as torch_multiprocessing
 
 from torchrl_ecpo.experiment import compose_options
 
@@ -96,4 +97,5 @@ def run_here(beside, monkeypatch):
 @pytest.fixture
 def forked_workers(monkeypatch):
     """Worker processes start from one that has imported torch, and not afresh: in no time."""
-    monkeypatch.setattr(multiprocessing, "get_context", lambda method=None: FORKED)
+    for module in (multiprocessing, torch_multiprocessing):
+        monkeypatch.setattr(module, "get_context", lambda method=None: FORKED)

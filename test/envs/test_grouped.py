@@ -165,6 +165,7 @@ def test_partial_steps_and_resets_leave_the_others_where_they_are(make):
     env.close()
 
 
+@pytest.mark.usefixtures("forked_workers")
 @pytest.mark.parametrize("make", [cartpole, "CartPole-v1"], ids=["ParallelEnv", "AsyncVectorEnv"])
 def test_parallel(make):
     env = make_grouped_env(make, num_groups=1, group_size=2, parallel=True)
