@@ -734,6 +734,7 @@ def test_an_error_of_a_worker_that_cannot_travel_is_told():
         _serve(request)
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_workers_that_play_frames_number_their_own_trajectories():
     """And fill a buffer, by way of what a user does to a batch."""
     buffer = ReplayBuffer(storage=LazyTensorStorage(100), batch_size=4)
