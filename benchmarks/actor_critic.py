@@ -52,7 +52,11 @@ UPDATES = {
     "ecac, M = 8": ["loss=ecac"],
     "ecac, M = 16": ["loss=ecac", "loss.num_action_samples=16"],
 }
-LOOPS = {"sac": ["loss=sac"], "ecac": ["loss=ecac"]}
+LOOPS = {
+    "sac": ["loss=sac"],
+    "ecac": ["loss=ecac"],
+    "ecac, compiled": ["loss=ecac", "compile=true"],
+}
 
 # Made in a turn
 NUM_UPDATES = 10
@@ -83,6 +87,9 @@ def make_parts(config: DictConfig) -> Parts:
     actor = make_actor(config, env)
     loss_module = make_loss(config, actor, env)
     updater = make_updater(config, loss_module)
+    if config.compile:
+        compile_module(loss_module, "update")
+        compile_module(actor, "policy")
     return Parts(env, actor, loss_module, updater, make_optimizer(config.optim, loss_module))
 
 
@@ -121,8 +128,6 @@ def update(config: DictConfig) -> Iteration:
     env, _, loss_module, updater, optimizer = make_parts(config)
     batch = random_batch(env.fake_tensordict(), config.replay_buffer.batch_size)
     batch = batch.select(*loss_module.in_keys)
-    if config.compile:
-        compile_module(loss_module, "update")
 
     def iterate() -> int:
         for _ in range(NUM_UPDATES):
