@@ -25,11 +25,13 @@ SHORTEST = {
     "sampler": "--repeats 1 --sizes 1e4",
     "stacked": "--repeats 1 --runs 1 --levels 2",
 }
-EXTRAS = {
+NEEDS = {
     "actor_critic": "stable_baselines3",
+    "compile": "mujoco",
     "groups": "minigrid",
-    "llm_lengths": "transformers",
+    "growth": "mujoco",
     "llm_memory": "transformers",
+    "parts": "mujoco",
 }
 
 
@@ -46,7 +48,8 @@ def test_all_are_listed() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHORTEST)
 def test_benchmark(name: str, tmp_path: Path) -> None:
-    pytest.importorskip(EXTRAS.get(name, "mujoco"))
+    if name in NEEDS:
+        pytest.importorskip(NEEDS[name])
     table = tmp_path / "table.csv"
     options = [*SHORTEST[name].split(), "--csv", str(table)]
     result = run_script(tmp_path, BENCHMARKS / f"{name}.py", *options, afresh=True)
