@@ -30,13 +30,12 @@ from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import LossModule, TargetNetUpdater
 
-from torchrl_ecpo.experiment import compile_module
-
 SCRIPT = Path(__file__).resolve().parents[1] / "sota-implementations/ecac"
 sys.path.append(str(SCRIPT))
 
 from ecac import descend, total  # noqa: E402 # pyright: ignore[reportMissingImports]
 from utils import (  # noqa: E402 # pyright: ignore[reportMissingImports]
+    compile_parts,
     make_actor,
     make_collector,
     make_environment,
@@ -87,9 +86,7 @@ def make_parts(config: DictConfig) -> Parts:
     actor = make_actor(config, env)
     loss_module = make_loss(config, actor, env)
     updater = make_updater(config, loss_module)
-    if config.compile:
-        compile_module(loss_module, "update")
-        compile_module(actor, "policy")
+    compile_parts(config, loss_module, actor)
     return Parts(env, actor, loss_module, updater, make_optimizer(config.optim, loss_module))
 
 

@@ -20,6 +20,7 @@ class Renorm(BatchRenorm1d):
     def forward(self, x: Tensor) -> Tensor:
         """Normalise the units of a batch."""
         outputs = super().forward(x)
+        # Not clamp_, which vmap has no rule for.
         self.num_batches_tracked.copy_(self.num_batches_tracked.clamp(max=self.warmup_steps))
         return outputs
 

@@ -27,6 +27,7 @@ from utils import (
     Every,
     Speed,
     check_config,
+    compile_parts,
     compute_losses,
     evaluate,
     finished_returns,
@@ -49,7 +50,6 @@ from torchrl_ecpo.experiment import (
     Checkpoints,
     Progress,
     Run,
-    compile_module,
     leaving_nothing,
 )
 
@@ -88,10 +88,7 @@ def main(config: DictConfig) -> None:
     optimizer = make_optimizer(config.optim, loss_module)
     replay_buffer = make_replay_buffer(config)
     collector = make_collector(config, make_policy(config.loss, actor, evaluation_env))
-    if config.compile:
-        compile_module(loss_module, "update")
-    if config.compile and config.collector.kind == "single":
-        compile_module(actor, "policy")
+    compile_parts(config, loss_module, actor)
 
     progress = Progress(frames=0, updates=0, returns=[], losses={})
     is_log_due, is_evaluation_due = Every(config.log_interval), Every(config.evaluation.interval)

@@ -57,6 +57,7 @@ from torchrl_ecpo._torchrl import carrier_of, generator_of, set_carrier
 from torchrl_ecpo.collectors import SupervisedAsyncCollector, SupervisedSyncCollector
 from torchrl_ecpo.collectors.workers import spawn_seeds
 from torchrl_ecpo.envs import EpisodeReplay
+from torchrl_ecpo.experiment import compile_module
 from torchrl_ecpo.experiment._tasks import missing, wrap_task
 from torchrl_ecpo.experiment._videos import greedy_episodes, save_gif, with_pixels
 from torchrl_ecpo.modules import (
@@ -346,6 +347,14 @@ def make_replay_buffer(config: DictConfig) -> ReplayBuffer:
         batch_size=config.replay_buffer.batch_size,
         generator=torch.Generator().manual_seed(config.seed),
     )
+
+
+def compile_parts(config: DictConfig, loss_module: LossModule, actor: TensorDictModuleBase) -> None:
+    """Compile what ``compile=true`` asks for: the update, and the policy that acts here."""
+    if config.compile:
+        compile_module(loss_module, "update")
+        if config.collector.kind == "single":
+            compile_module(actor, "policy")
 
 
 class CollectorState:

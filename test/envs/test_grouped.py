@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import sys
 from functools import partial
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
@@ -373,11 +374,15 @@ def test_episodes_that_are_over_are_forgotten(make):
                 env.reset(start.clone().set("_reset", torch.tensor([mask])))
 
     def kept():
-        """Bytes of the environment and of all that it refers to, but code."""
+        """Bytes of the environment, our modules, and all that they refer to, but others' code."""
         code = (type, ModuleType, FunctionType, MethodType, BuiltinFunctionType)
-        sizes, left = {}, [env]
+        is_ours = re.compile(r"torchrl_ecpo\b").match
+        sizes = {}
+        left = [env, *(vars(module) for name, module in sys.modules.items() if is_ours(name))]
         while left:
-            if id(each := left.pop()) not in sizes and not isinstance(each, code):
+            each = left.pop()
+            is_code = isinstance(each, code) and not is_ours(f"{getattr(each, '__module__', '')}")
+            if id(each) not in sizes and not is_code:
                 sizes[id(each)] = sys.getsizeof(each)
                 left += gc.get_referents(each)
         return sum(sizes.values())
