@@ -7,14 +7,18 @@ from contextlib import closing, suppress
 
 import gymnasium as gym
 
+OF_ONE_CHOICE = ("acrobot", "cartpole", "minatar")
+
 
 def chosen_loss(options: Sequence[str]) -> list[str]:
     """The option ``loss=``, if none is given and a task of gymnasium takes one discrete action."""
     given = {name: value for name, _, value in (option.partition("=") for option in options)}
-    if "loss" in given or given.get("env") not in ("gym", "minatar"):
+    if "loss" in given:
         return []
-    if given["env"] == "minatar":
+    if given.get("env") in OF_ONE_CHOICE:
         return ["loss=discrete_ecac"]
+    if given.get("env") != "gym":
+        return []
     with (
         suppress(gym.error.Error, ModuleNotFoundError, ValueError),  # which is said later
         closing(gym.make(given.get("env.name", ""), disable_env_checker=True)) as env,

@@ -48,6 +48,7 @@ IMPLIED = {
     "policy.hidden_size": 128,
     "epochs": 1,
     "max_kl": "None",
+    "method.name": "ppo",
     "loss.width_entropy": 1.0,
     "critic": "plain",
     # Of what is not learned, which had none.

@@ -58,7 +58,7 @@ COLOURS = (BLUE, GREEN, RED, PINK, ORANGE, SKY, PURPLE, BROWN)
 METHOD_COLOURS = {
     **dict.fromkeys(("ecpo", "ecac", "ecacphi04", "centred", "centredscale", "meanseeking"), BLUE),
     **dict.fromkeys(("urex", "sac", "sacphi04", "noprojection", "referencekept"), GREEN),
-    **dict.fromkeys(("ment", "td3", "tau0"), RED),
+    **dict.fromkeys(("ment", "td3", "tau0", "dqn"), RED),
     **dict.fromkeys(("tpo", "ddpg", "plainreturns", "eq11"), PINK),
     **dict.fromkeys(("drgrpo", "grpo", "freshbatches", "k5andm5"), ORANGE),
     **dict.fromkeys(("pmdentropy", "pmdacentropy", "smallstartat1e3"), ORANGE),

@@ -1,9 +1,10 @@
-"""PPO of Stable-Baselines3 on the tasks of exploration: the outside reference of the study.
+"""PPO and DQN of Stable-Baselines3: the outside reference of the study.
 
-On ``env=popgym`` it is sb3-contrib's ``RecurrentPPO``, whose policy has an LSTM.
+On ``env=popgym`` PPO is sb3-contrib's ``RecurrentPPO``, whose policy has an LSTM.
 
-``python ppo.py env=deep_sea seed=1`` with the extra ``bench``. It leaves the files of a run of
-``ecpo.py``; one that is stopped begins anew.
+``python sb3.py env=cartpole method=dqn seed=1`` with the extra ``bench``. It leaves the files of a
+run of ``ecpo.py``, or of ``ecac.py`` where the length counts in frames; one that is stopped begins
+anew.
 """
 
 from __future__ import annotations
@@ -21,17 +22,21 @@ import gymnasium as gym
 import hydra
 import numpy as np
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from sb3_contrib import RecurrentPPO
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
-from stable_baselines3 import PPO
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import Tensor, nn
 
 from torchrl_ecpo.envs import DeepSeaEnv, readable
 from torchrl_ecpo.experiment import Run, leaving_nothing, refuse_resume
+from torchrl_ecpo.experiment._tasks import open_task
 
 LEAST_ENTROPY = 0.1  # nats an episode
 
@@ -82,45 +87,77 @@ class EpisodeLstmPolicy(RecurrentActorCriticPolicy):
 
 
 class Record(BaseCallback):
-    """Logs every so many episodes what ``ecpo.py`` logs of a batch."""
+    """Logs every so many episodes or frames what scripts of ours log."""
 
-    def __init__(self, run: Run, config: DictConfig) -> None:
+    def __init__(self, run: Run, config: DictConfig, unit: str) -> None:
         super().__init__()
-        self.run, self.config = run, config
-        self.episodes: list[tuple[float, int]] = []
+        self.run, self.config, self.unit = run, config, unit
+        self.total = config[f"total_{unit}"]
+        self.episodes: list[tuple[float, int]] = []  # return and length
         self.surprise: float | None = None  # of a step, in nats
         self.held = 0  # rows that the entropy has been gone
 
     def _on_rollout_end(self) -> None:
-        model: Any = self.model
-        self.surprise = -float(model.rollout_buffer.log_probs.mean())
+        if isinstance(self.model, OnPolicyAlgorithm):
+            self.surprise = -float(self.model.rollout_buffer.log_probs.mean())
 
     def _on_step(self) -> bool:
         ends = [info["episode"] for info in self.locals["infos"] if "episode" in info]
         self.episodes += [(end["r"], end["l"]) for end in ends]
         interval, stop = self.config.log_interval, self.config.stop_when
-        if len(self.episodes) >= interval:
-            returns, lengths = np.array(self.episodes[:interval]).T
-            del self.episodes[:interval]
-            metrics = {"return": returns.mean(), "length": lengths.mean()}
-            metrics["pass_at_1"] = (returns >= self.config.env.solved).mean()
-            if self.surprise is not None:
-                metrics["entropy"] = self.surprise * lengths.mean()
+        if self.unit == "frames":
+            is_due, rows = self.num_timesteps >= self.run.step + interval, len(self.episodes)
+        else:
+            is_due, rows = len(self.episodes) >= interval, interval
+        if is_due:
+            metrics = self.measured(self.episodes[:rows])
+            del self.episodes[:rows]
             self.run.log(metrics, step=self.run.step + interval)
             is_gone = metrics.get("entropy", np.inf) < LEAST_ENTROPY
             self.held = self.held + 1 if is_gone else 0
         is_over = stop is not None and self.held >= stop.batches
-        return self.run.step < self.config.total_trajectories and not is_over
+        return self.run.step < self.total and not is_over
+
+    def measured(self, episodes: list[tuple[float, int]]) -> dict[str, float]:
+        """Of episodes; nothing but the name where none has ended."""
+        if not episodes:
+            return {"return": np.nan}
+        returns, lengths = np.array(episodes).T
+        metrics = {"return": returns.mean(), "length": lengths.mean()}
+        if "solved" in self.config.env:
+            metrics["pass_at_1"] = (returns >= self.config.env.solved).mean()
+        if self.surprise is not None:
+            metrics["entropy"] = self.surprise * lengths.mean()
+        return metrics
 
 
 def make_env(config: DictConfig) -> gym.Env:
     """One copy, with the return and the length of each episode."""
     own = config.env
     if own.name == "deep_sea":
-        env: gym.Env = DeepSea(own.size, own.instance_seed)
-    else:
-        env = gym.make(own.name, max_episode_steps=own.max_steps, disable_env_checker=True)
-    return Monitor(readable(env))
+        return Monitor(readable(DeepSea(own.size, own.instance_seed)))
+    return Monitor(open_task(own.name, max_episode_steps=own.max_steps))
+
+
+def make_model(config: DictConfig, unit: str) -> BaseAlgorithm:
+    """The method, with its settings of this task."""
+    name = config.method.name
+    if name == "dqn" and unit != "frames":
+        raise ValueError(
+            "method=dqn explores less and less over total_frames, which env.name="
+            f"{config.env.name} has not: take a task that counts frames, or method=ppo."
+        )
+    envs: Any = DummyVecEnv([partial(make_env, config)] * config.n_envs)
+    settings: Any = OmegaConf.to_container(config[name], resolve=True)
+    if config.normalize:
+        envs = VecNormalize(envs, gamma=settings["gamma"])
+    for falling in config.get("linear", ()):  # of some settings alone
+        settings[falling] = LinearSchedule(settings[falling], 0.0, end_fraction=1.0)
+    policy: Any = "MlpPolicy"
+    method: Any = {"ppo": PPO, "dqn": DQN}[name]
+    if config.get("recurrent", False):  # of env=popgym alone
+        method, policy = RecurrentPPO, EpisodeLstmPolicy
+    return method(policy, envs, seed=config.seed, device="cpu", **settings)
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="config")
@@ -128,21 +165,20 @@ def make_env(config: DictConfig) -> gym.Env:
 def main(config: DictConfig) -> None:
     refuse_resume(config)
     torch.set_num_threads(1)
-    envs: Any = DummyVecEnv([partial(make_env, config)] * config.n_envs)
-    if config.normalize:
-        envs = VecNormalize(envs, gamma=config.ppo.gamma)
-    is_recurrent = config.get("recurrent", False)  # of env=popgym alone
-    method, policy = (RecurrentPPO, EpisodeLstmPolicy) if is_recurrent else (PPO, "MlpPolicy")
-    model = method(policy, envs, seed=config.seed, device="cpu", **config.ppo)
+    unit = "frames" if "total_frames" in config else "trajectories"
+    model = make_model(config, unit)
+    total = config[f"total_{unit}"]
     run = Run(
         config,
-        total=config.total_trajectories,
-        unit="trajectories",
-        name=f"{config.env.name}/ppo/seed_{config.seed}",
+        total=total,
+        unit=unit,
+        name=f"{config.env.name}/{config.method.name}/seed_{config.seed}",
         shown=("return", "pass_at_1", "entropy"),
     )
     with run:
-        model.learn(sys.maxsize, callback=Record(run, config))
+        whole_rows = -(-total // config.log_interval) * config.log_interval
+        steps = whole_rows if unit == "frames" else sys.maxsize
+        model.learn(steps, callback=Record(run, config, unit))
 
 
 if __name__ == "__main__":
