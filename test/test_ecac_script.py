@@ -326,7 +326,8 @@ def test_bad_options_end_with_a_clear_message(utils, overrides, message):
         ("env=gym env.name=Chess-v0", []),
         ("env=gym", []),
         ("env=minatar env.name=MinAtar/Breakout-v1", ["loss=discrete_ecac"]),
-        ("env=acrobot", ["loss=discrete_ecac"]),
+        ("env=acrobot,cartpole", ["loss=discrete_ecac"]),
+        ("env=acrobot,pendulum", []),
         ("env=pendulum", []),
     ],
 )

@@ -50,6 +50,8 @@ def test_a_run_has_rows_of_so_many_frames_and_ends_with_a_whole_one(tmp_path, op
     assert metrics["step"] == [400, 800]
     assert metrics["length"][-1] > 1
     assert ("entropy" in metrics) == ("method=dqn" not in options)
+    if "entropy" in metrics:  # of an action
+        assert metrics["entropy"][-1] == pytest.approx(math.log(3), rel=0.05)
     assert ("pass_at_1" in metrics) == ("env=cartpole" in options)
     assert summary["finished"]
     assert summary["frames"] == 800

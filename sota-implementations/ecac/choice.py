@@ -15,7 +15,7 @@ def chosen_loss(options: Sequence[str]) -> list[str]:
     given = {name: value for name, _, value in (option.partition("=") for option in options)}
     if "loss" in given:
         return []
-    if given.get("env") in OF_ONE_CHOICE:
+    if {*given.get("env", "").split(",")} <= {*OF_ONE_CHOICE}:
         return ["loss=discrete_ecac"]
     if given.get("env") != "gym":
         return []

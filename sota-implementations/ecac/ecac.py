@@ -1,4 +1,4 @@
-"""Train ECAC, PMD-AC, SAC, TD3 or DDPG on continuous control.
+"""Train ECAC, or a rival with a critic, on continuous control or one discrete action.
 
 ``python ecac.py env=halfcheetah loss=ecac seed=1``; every option is in ``config/``.
 """

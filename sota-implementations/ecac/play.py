@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         check_count("--episodes", options.episodes)
         directory = options.run.resolve()
         config: Any = OmegaConf.load(directory / "config.yaml")
-        if "total_frames" not in config:
+        if not {"total_frames", "collector"} <= config.keys():
             raise ValueError(f"{directory} is no run of ecac.py.")
         make = partial(make_environment, config, seed=config.seed + 1_000_000)
         env = make()

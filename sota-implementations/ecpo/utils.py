@@ -6,6 +6,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -31,6 +32,7 @@ from torchrl_ecpo import (
 from torchrl_ecpo.collectors import TrajectoryGroupCollector
 from torchrl_ecpo.experiment import Run
 from torchrl_ecpo.experiment._tasks import is_plain
+from torchrl_ecpo.experiment.options import parse
 from torchrl_ecpo.schedules import TemperatureScheduler, make_schedule
 
 LOSSES = {  # whose files in config/loss/ are older than the entry class
@@ -44,20 +46,38 @@ TEMPERATURES = ("tau", "tau_prime", "kl_to_ref_coeff")
 ENDLESS = 10_000  # steps of a trajectory, unless the task has longer ones
 COMPILABLE = ("bandit", "gym")
 LEAST_ESS = 1.5
+PUBLISHED = Path(__file__).parent / "config/setting/paper"
 PATIENCE = 10  # batches running
 
 
-def check_config(config: DictConfig) -> None:
+def check_config(config: DictConfig, options: Sequence[str] = ()) -> None:
     """Refuse options that do not go together, with a line for each."""
     loss_class(config.loss)
     if config.env.kind == "gym":
         is_plain(config.env.name)
-    if problems := [*_problems(config)]:
+    if problems := [*_problems(config, options)]:
         raise ValueError("\n".join(problems))
 
 
-def _problems(config: DictConfig) -> Iterator[str]:
+def _problems(config: DictConfig, options: Sequence[str]) -> Iterator[str]:
     kind = config.env.kind
+    given = {own.key_or_group: own.value() for own in parse(options)}
+    own = f"{given.get('env', 'bandit')}/{given.get('loss', 'ecpo')}"  # or what config.yaml has
+    if given.get("form") == "paper" and not (PUBLISHED / f"{own}.yaml").is_file():
+        files = [*PUBLISHED.glob("*/*.yaml")]
+        tasks, losses = (
+            sorted({file.parent.name for file in files}),
+            sorted({file.stem for file in files}),
+        )
+        yield (
+            f"form=paper is for env= of {', '.join(tasks)} and loss= of {', '.join(losses)}; with "
+            f"{own} it would change nothing. Leave out form."
+        )
+    if config.loss.get("delay_actor"):
+        yield (
+            "loss.delay_actor=true: the script moves no copy of the policy, which would stay as it "
+            "began. Leave it out."
+        )
     if config.compile and not (config.seeds is None and config.stack is None):
         yield (
             "compile=true is for single runs. Leave out compile, or seeds and stack: --multirun "

@@ -1,6 +1,8 @@
 """The same model, prompts and evaluation in TRL's GRPOTrainer, with its own loss: ``loss=trl``.
 
-``python by_trl.py env=countdown loss=trl seed=1``; the options are those of ``llm.py``.
+``python by_trl.py env=countdown loss=trl seed=1``; the options are those of ``llm.py``. It measures
+at the start and at the end, and writes no checkpoint: ``evaluation.interval`` and ``checkpoint.*``
+count for nothing.
 """
 
 from __future__ import annotations

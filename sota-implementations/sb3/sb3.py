@@ -38,7 +38,7 @@ from torchrl_ecpo.envs import DeepSeaEnv, readable
 from torchrl_ecpo.experiment import Run, leaving_nothing, refuse_resume
 from torchrl_ecpo.experiment._tasks import open_task
 
-LEAST_ENTROPY = 0.1  # nats an episode
+LEAST_ENTROPY = 0.1  # nats, in the unit of its column
 
 
 class DeepSea(gym.Env):
@@ -87,7 +87,10 @@ class EpisodeLstmPolicy(RecurrentActorCriticPolicy):
 
 
 class Record(BaseCallback):
-    """Logs every so many episodes or frames what scripts of ours log."""
+    """Logs every so many episodes or frames what scripts of ours log.
+
+    The entropy is that of an episode, or of an action where the length counts in frames.
+    """
 
     def __init__(self, run: Run, config: DictConfig, unit: str) -> None:
         super().__init__()
@@ -127,7 +130,8 @@ class Record(BaseCallback):
         if "solved" in self.config.env:
             metrics["pass_at_1"] = (returns >= self.config.env.solved).mean()
         if self.surprise is not None:
-            metrics["entropy"] = self.surprise * lengths.mean()
+            actions = 1.0 if self.unit == "frames" else lengths.mean()
+            metrics["entropy"] = self.surprise * actions
         return metrics
 
 

@@ -22,7 +22,7 @@ MAY_DIFFER = (
 
 def check_runs(config: DictConfig, overrides: Sequence[str]) -> None:
     """Refuse a run, or stacked ones, whose options do not go together."""
-    check_config(config)
+    check_config(config, overrides)
     if config.seeds is not None or config.stack is not None:
         runs_of(config, overrides)
 
@@ -42,8 +42,9 @@ def runs_of(config: DictConfig, overrides: Sequence[str]) -> dict[str, DictConfi
     runs = []
     for options in _asked_for(config):
         own = {override.key_or_group: str(override.input_line) for override in parse(options)}
-        runs.append(compose_options(FOLDER, list({**shared, **own}.values())))
-        check_config(runs[-1])
+        lines = list({**shared, **own}.values())
+        runs.append(compose_options(FOLDER, lines))
+        check_config(runs[-1], lines)
     _check_together(runs)
     if config.stack is None:
         return {f"seed_{run.seed}": run for run in runs}
