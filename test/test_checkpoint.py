@@ -588,12 +588,18 @@ def test_where_a_run_goes(tmp_path, monkeypatch, resume, directory):
     # Of runs that died before their first checkpoint, and while it was written.
     Path("2026-03-01").mkdir()
     Path("2026-04-01/checkpoints/.checkpoint-10").mkdir(parents=True)
+    # One that a user has put aside.
+    Path("2026-05-01/checkpoints/checkpoint-10.bad").mkdir(parents=True)
     assert Path(run_directory(resume, ".", "new")).resolve() == tmp_path / directory
     assert Path(run_directory("auto", "other", "new")) == Path("other/new")
 
 
 def test_ctrl_c_and_resume_auto_as_a_user_types_them(tmp_path):
-    script, options = SCRIPTS / "ecpo/ecpo.py", (*RUNS["bandit"][1:3], "group_size=5")
+    own = tmp_path / "mine/env/own.yaml"
+    own.parent.mkdir(parents=True)
+    own.write_text("# @package _global_\ndefaults: [bandit, _self_]\n")
+    options = ("--config-dir", "mine", "env=own", *RUNS["bandit"][1:3], "group_size=5")
+    script = SCRIPTS / "ecpo/ecpo.py"
     process = start_script(tmp_path, script, *options, "total_trajectories=2000000")
     while not list(tmp_path.glob("runs/*/*/*/*/metrics.csv")):
         assert process.is_alive(), "the run has ended before its first record"

@@ -11,7 +11,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict import assert_close as assert_td_close
-from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
+from tensordict.nn import (
+    NormalParamExtractor,
+    TensorDictModule,
+    TensorDictParams,
+    TensorDictSequential,
+)
 from torch import nn
 from torch.testing import assert_close
 from torchrl.data import (
@@ -34,6 +39,7 @@ from torchrl.envs import (
 )
 from torchrl.modules import (
     LSTMModule,
+    OrnsteinUhlenbeckProcessModule,
     ProbabilisticActor,
     RandomPolicy,
     TanhNormal,
@@ -234,6 +240,42 @@ def test_recurrent_policies_need_no_transforms():
     assert (batches[1]["is_init"].squeeze(-1) == first)[mask].all()
 
 
+def test_the_primers_of_a_recurrent_policy_may_be_in_the_copies():
+    """TorchRL's usual place."""
+    torch.manual_seed(0)
+    policy = TensorDictSequential(
+        LSTMModule(3, 5, in_key="observation", out_key="features", default_recurrent_mode=False),
+        TensorDictModule(nn.Linear(5, 1), ["features"], ["action"]),
+    )
+
+    def make(primed):
+        env = TransformedEnv(GymEnv("Pendulum-v1"), StepCounter(max_steps=6))
+        if primed:
+            env.append_transform(get_env_transforms_from_module(policy))
+        return env
+
+    batches = []
+    for primed in (True, False):
+        env = GroupedEnv(partial(make, primed), num_groups=1, group_size=2)
+        env.set_seed(0)
+        batches.append(collect(env, policy, num_groups=1, group_size=2))
+    assert_close(batches[0]["features"], batches[1]["features"])
+    with torch.no_grad():
+        features, _ = policy[0].lstm(batches[0]["observation"].flatten(0, 1))
+    assert_close(batches[0]["features"].flatten(0, 1), features)
+
+
+def test_noise_of_a_process_goes_on_from_step_to_step():
+    action = TensorDictModule(lambda x: torch.zeros_like(x[..., :1]), ["observation"], ["action"])
+    noise = OrnsteinUhlenbeckProcessModule(
+        spec=Unbounded(1), annealing_num_steps=10, sigma=1.0, dt=0.1, theta=0.1, safe=False
+    )
+    env = TransformedEnv(Countdown(1, 4, shortest=60, longest=60), InitTracker())
+    batch = collect(env, TensorDictSequential(action, noise), num_groups=1, group_size=4)
+    before, after = batch["action"][..., :-1, 0].flatten(), batch["action"][..., 1:, 0].flatten()
+    assert torch.corrcoef(torch.stack([before, after]))[0, 1] > 0.7
+
+
 def count_steps(data):
     """A policy that names no keys, and that remembers in an entry of its own."""
     count = data.get("count", torch.zeros(*data.shape, 1)) + 1
@@ -386,6 +428,8 @@ def test_the_training_mode_is_the_policys():
         policy.module.train(training)
         batch = collector.rollout()
         assert (batch["training"][batch["collector", "mask"]] == training).all()
+        # Weights that are a module too, as a loss holds them, have no mode of their own.
+        collector.update_policy_weights_(TensorDictParams(TensorDict.from_module(policy)))
     collector.shutdown()
 
 
@@ -516,6 +560,8 @@ def test_state_dict_resumes_to_the_bit():
     assert_td_close(batch.exclude("group"), expected.exclude("group"))
     assert (batch["action"][batch["collector", "mask"]] == 4.0).all()
     assert batch["collector", "traj_ids"].max() > last["collector", "traj_ids"].max()
+    with pytest.raises(ValueError, match="state of each of 1 workers, got 2"):
+        other.load_state_dict({**state, "players": state["players"] * 2})
 
 
 @pytest.mark.usefixtures("forked_workers")

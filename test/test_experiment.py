@@ -16,7 +16,7 @@ from torchrl_ecpo.experiment import MetricsTable, Run, leaving_nothing, read_met
 from torchrl_ecpo.experiment import run as run_module
 from torchrl_ecpo.experiment.compare import Comparison, final, find_runs, load_comparison
 from torchrl_ecpo.experiment.compare import main as compare
-from torchrl_ecpo.experiment.figures import draw_curve, plot_learning_curve
+from torchrl_ecpo.experiment.figures import draw_curve, plot_comparison, plot_learning_curve
 
 PNG = b"\x89PNG\r\n"
 
@@ -249,6 +249,16 @@ def runs(tmp_path, monkeypatch):
                 for i, value in enumerate(returns):
                     run.log({"return": value}, step=10 * (i + 1))
     return tmp_path
+
+
+def test_a_picture_has_the_levels_of_its_own_panels(tmp_path):
+    curves = {"ecpo": (np.arange(3.0), np.ones((2, 3)))}
+    levels = {"Copy": {"solved": 25.0}, "Reverse": {"perfect": 31.0}}
+    path = plot_comparison(
+        {"Copy": curves}, tmp_path / "a.svg", x_label="", y_label="", levels=levels
+    )
+    assert "solved" in path.read_text()
+    assert "perfect" not in path.read_text()
 
 
 def test_comparison_puts_the_runs_of_a_method_together(runs):

@@ -11,13 +11,15 @@ import gymnasium
 import numpy
 import pytest
 import torch
+from tensordict import TensorDict
 from torch.testing import assert_close
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import Composite, LazyTensorStorage, TensorDictReplayBuffer, Unbounded
 from torchrl.envs import (
     Compose,
     DMControlEnv,
     DoubleToFloat,
+    EnvBase,
     FrameSkipTransform,
     GymEnv,
     GymWrapper,
@@ -341,6 +343,38 @@ def test_episodes_of_unseen_steps_are_not_replayed(nested):
     other.load_state_dict(env.state_dict())
     after = [each.step(state.clone().set("action", torch.ones(1))) for each in (env, other)]
     assert_close(after[0]["next", "observation"], after[1]["next", "observation"], rtol=0, atol=0)
+
+
+def test_an_episode_of_a_seed_given_to_its_reset_is_replayed():
+    env, other = (TransformedEnv(GymEnv("Pendulum-v1"), EpisodeReplay()) for _ in range(2))
+    start = env.reset(seed=3)
+    env.step(start.set("action", torch.zeros(1)))
+    other.load_state_dict(env.state_dict())
+    action = TensorDict({"action": torch.ones(1)})
+    after, again = (each.step(action.clone())["next"] for each in (env, other))
+    assert (after["observation"] == again["observation"]).all()
+
+
+def test_the_copies_move_with_their_environment():
+    class Still(EnvBase):
+        def __init__(self):
+            super().__init__()
+            self.observation_spec = Composite(observation=Unbounded(2))
+            self.action_spec = self.reward_spec = Unbounded(1)
+
+        def _reset(self, tensordict=None, **kwargs):
+            return TensorDict(observation=torch.zeros(2), device=self.device)
+
+        def _step(self, tensordict):
+            return self._reset().set("reward", tensordict["action"])
+
+        def _set_seed(self, seed):
+            pass
+
+    env = GroupedEnv(Still, num_groups=1, group_size=2)
+    assert env.to("meta") is env
+    assert env.copies.device == env.device == torch.device("meta")
+    assert env._group.device == env.device
 
 
 class Careless(gymnasium.Env):

@@ -149,6 +149,20 @@ def test_a_copy_that_is_over_is_left_alone(parallel):
     env.close(raise_if_closed=False)
 
 
+def test_a_reset_is_given_no_options_that_nobody_gave():
+    class Level(gymnasium.Env):
+        observation_space = gymnasium.spaces.Box(-1, 1, (2,))
+        action_space = gymnasium.spaces.Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.level = 1 if options is None else options["level"]
+            return np.zeros(2, dtype=np.float32), {}
+
+    env = make_grouped_env(Level, num_groups=1, group_size=2)
+    assert env.reset()["observation"].shape == (1, 2, 2)
+
+
 def test_a_reward_may_be_an_array_of_one_number():
     class Boxed(Countdown):
         def step(self, action):

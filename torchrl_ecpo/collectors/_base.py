@@ -27,7 +27,6 @@ class PlayerCollector(BaseCollector):
         replay_buffer: where to write the steps of each batch, flat.
     """
 
-    trajs_per_batch = None  # TorchRL's way of cutting whole trajectories from batches of frames
     init_random_frames = 0
     _workers: Workers
 
@@ -114,12 +113,11 @@ class PlayerCollector(BaseCollector):
                 raise ValueError("update_policy_weights_ takes the weights of one policy, once.")
             policy_or_weights = weights_dict["policy"]
         source = self._learner if policy_or_weights is None else policy_or_weights
-        if isinstance(source, nn.Module):
+        if isinstance(source, nn.Module) and not isinstance(source, TensorDictBase):
             self._moded = source
-            own: Any = TensorDict.from_module(source)
-            source = own.data
+            source = TensorDict.from_module(source)
         if isinstance(source, TensorDictBase):
-            self._workers.set_weights(source)
+            self._workers.set_weights(source.data)
         elif source is not self._learner:  # which may be a function, without weights
             raise TypeError(
                 "policy_or_weights must be a module or a TensorDict of weights, got "
@@ -146,7 +144,13 @@ class PlayerCollector(BaseCollector):
         """Go on from what :meth:`state_dict` returned."""
         frames = check_count("frames", state_dict["frames"], least=0)
         count = check_count("iter", state_dict["iter"], least=-1)
-        self._workers.call("load_state_dict", state_dict["players"])
+        players = state_dict["players"]
+        if len(players) != len(self._workers):
+            raise ValueError(
+                f"players must hold the state of each of {len(self._workers)} workers, got "
+                f"{len(players)}. Make the collector with as many as it had."
+            )
+        self._workers.call("load_state_dict", players)
         self._workers.forget()
         self._frames, self._iter = frames, count
 

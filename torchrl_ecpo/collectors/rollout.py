@@ -24,6 +24,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import (
+    OrnsteinUhlenbeckProcessModule,
     RandomPolicy,
     get_env_transforms_from_module,
     set_exploration_modules_spec_from_env,
@@ -81,7 +82,7 @@ class GroupPlayer:
         # around the rules of a fast environment.
         self.env, self._reset_env = env, _with_transforms(env, self.policy)
         read = [] if isinstance(self.policy, RandomPolicy) else getattr(policy, "in_keys", None)
-        self._read = None if read is None else set(map(unravel_key, read))
+        self._read = None if read is None else {*map(unravel_key, read), *_read_unsaid(policy)}
         own = env.full_observation_spec.keys(True, True)
         added = self._reset_env.full_observation_spec.keys(True, True)
         self._first_keys = [k for k in added if k not in own and _path(k)[-1] == "is_init"]
@@ -99,8 +100,8 @@ class GroupPlayer:
             )
         if self.num_groups % (batch.numel() // self.group_size):
             raise ValueError(
-                f"num_groups={self.num_groups} must be a multiple of the number of groups that the "
-                f"environment plays at a time, {batch.numel() // self.group_size}."
+                f"A player's share of num_groups, {self.num_groups}, must be a multiple of the "
+                f"groups that its environment plays at a time, {batch.numel() // self.group_size}."
             )
         specs = dict(env.full_observation_spec.items(True, True))
         if self.group_key not in [*specs]:
@@ -282,8 +283,11 @@ class GroupPlayer:
         result = {unravel_key(key[1:]) for key in every - given}
         written = set(acted.keys(True, True))
         handed = {key for key in written if key[0] == "next"}
-        # What the environment observes counts, as in TorchRL's collector; primers only pass on.
-        observed = set(self._levels()[0].full_observation_spec.keys(True, True))
+        # What the environment observes counts, as in TorchRL's collector; primers, whose entries
+        # are its state too, only pass on.
+        own = self._levels()[0]
+        observed = set(own.full_observation_spec.keys(True, True))
+        observed -= set(own.full_state_spec.keys(True, True))
         carried = {own: key for key in handed if (own := unravel_key(key[1:])) not in observed}
         dropped = self.exclude_keys | carried.keys()
         named = map(unravel_key, getattr(self.policy, "out_keys", self.env.action_keys))
@@ -333,6 +337,13 @@ class _Step(NamedTuple):
     """`[*B, K, *]` each."""
     decided: list[Tensor]
     """`[n, *]` each."""
+
+
+def _read_unsaid(policy: Any) -> list[NestedKey]:
+    """What modules read beside their ``in_keys``: a process of noise, where it stands."""
+    modules = policy.modules() if isinstance(policy, nn.Module) else ()
+    noises = [each for each in modules if isinstance(each, OrnsteinUhlenbeckProcessModule)]
+    return [key for noise in noises for key in (noise.is_init_key, *noise.ou.out_keys)]
 
 
 def _acted_on(env: EnvBase) -> list[NestedKey]:

@@ -109,7 +109,7 @@ class Workers:
     def tell(self, name: str, news: Any) -> None:
         """Call a method of all players with this before whatever they do next, or at once."""
         if self._workers[0].is_idle:
-            self.call(name, [news])
+            self.call(name, [news] * len(self))
         else:
             self._news = [{**own, name: news} for own in self._news]
 
@@ -131,8 +131,8 @@ class Workers:
 
     def call(self, name: str, *arguments: Sequence[Any]) -> list[Any]:
         """Call a method of all players, each with an own one of each of the arguments."""
-        rows = list(zip(*arguments, strict=True)) or [()] * len(self)
-        futures = [self._submit(worker, name, *row) for worker, row in enumerate(rows)]
+        rows = zip(range(len(self)), *arguments, strict=True)
+        futures = [self._submit(worker, name, *row) for worker, *row in rows]
         return [self._result(worker, future) for worker, future in enumerate(futures)]
 
     def forget(self) -> None:

@@ -120,6 +120,13 @@ class GroupedEnv(SeededGroups):
         out = self.copies.step(tensordict.reshape(-1))["next"]
         return self._add_group(out.reshape(self.batch_size))
 
+    def to(self, device: torch.device | str | int) -> GroupedEnv:
+        """Move the copies too."""
+        object.__setattr__(self, "copies", self.copies.to(device))
+        super().to(device)
+        self._group = self._group.to(self.device)
+        return self
+
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close the copies."""
         super().close(raise_if_closed=raise_if_closed)

@@ -32,7 +32,8 @@ class EpisodeReplay(Transform):
     differ from one to the next. Every task can play an episode again: the state dict holds the
     random generator's state before the last reset and the actions since; loading it resets and
     repeats them. That costs as much as the steps themselves. It is exact, because that generator is
-    all that is random in these tasks.
+    all that is random in these tasks; a seed given to ``reset`` of a gymnasium task counts, what
+    else ``reset`` is given does not.
 
     Only the simulator is put where it was: what an episode has summed or counted so far travels in
     the tensordict that the caller holds.
@@ -57,11 +58,22 @@ class EpisodeReplay(Transform):
     def __init__(self) -> None:
         super().__init__()
         self._start: str | None = None
+        self._before: Any = None  # the generator, within a reset
         self._actions: list[Tensor | dict[str, Any]] = []
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._start, self._actions = self._random_state(), []
+        self._before = self._generator()
         return tensordict
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        generator, before, self._before = self._generator(), self._before, None
+        if generator is not before and isinstance(generator, np.random.Generator):  # of a seed
+            bits = generator.bit_generator
+            self._start = _as_text(type(bits)(bits.seed_seq).state)
+        return tensordict_reset
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"]
@@ -103,7 +115,7 @@ class EpisodeReplay(Transform):
         generator = self._generator()
         is_legacy = isinstance(generator, np.random.RandomState)
         state = generator.get_state(legacy=False) if is_legacy else generator.bit_generator.state
-        return json.dumps(state, default=np.ndarray.tolist)
+        return _as_text(state)
 
     def _set_random_state(self, state: str) -> None:
         generator = self._generator()
@@ -133,3 +145,7 @@ class EpisodeReplay(Transform):
         # TorchRL hands on what it does not know to gymnasium's or dm_control's environment.
         env = self._task()
         return env.np_random if isinstance(env, GymWrapper) else env.task.random
+
+
+def _as_text(state: Any) -> str:
+    return json.dumps(state, default=np.ndarray.tolist)

@@ -228,6 +228,8 @@ class _Copy(gym.Wrapper):
         self.action_space = spaces.Discrete(1)  # of which a batch may be any list
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        if not kwargs.get("options"):  # gymnasium's vector environment makes an empty mapping
+            kwargs.pop("options", None)
         self._seen, _ = self.env.reset(**kwargs)
         return self._seen, {}
 

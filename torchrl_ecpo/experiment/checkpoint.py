@@ -254,7 +254,8 @@ class Checkpoints:
     @property
     def command(self) -> str:
         """What a user types to resume."""
-        kept = [each for each in command_line() if not each.lstrip("+").startswith("resume=")]
+        placed = ("resume=", "hydra.run.dir=")
+        kept = [each for each in command_line() if not each.lstrip("+").startswith(placed)]
         directory = str(self.directory)
         if not re.fullmatch(r"[\w./-]+", directory):  # hydra has a meaning for commas, for one
             directory = QuotedString(directory, Quote.single).with_quotes()
@@ -335,7 +336,7 @@ def run_directory(resume: str | None, parent: str, name: str) -> str:
     if resume is None:
         return f"{parent}/{name}"
     if resume == "auto":
-        runs = sorted({path.parents[1] for path in Path(parent).glob(f"*/{FOLDER}/checkpoint-*")})
+        runs = sorted(path.parent for path in Path(parent).glob(f"*/{FOLDER}") if _paths(path))
         return str(runs[-1] if runs else Path(parent, name))
     return str(Path(resume).absolute())
 

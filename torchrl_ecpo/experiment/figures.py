@@ -163,7 +163,8 @@ def plot_comparison(
     figure, axes, spare = _grid(len(panels), x_label, columns)
     methods = dict.fromkeys(method for curves in panels.values() for method in curves)
     colours = colours_of(methods)
-    names = dict.fromkeys(name for marked in (levels or {}).values() for name in marked)
+    marked = [levels[title] for title in panels if title in levels] if levels else []
+    names = dict.fromkeys(name for each in marked for name in each)
     dashes = dict(zip(names, itertools.cycle(((0, (4, 3)), (0, (1, 2))))))
     entries = {}  # of the legend
     for panel, (title, curves) in zip(axes, panels.items(), strict=True):

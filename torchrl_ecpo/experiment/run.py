@@ -383,7 +383,8 @@ def _as_step(step: Any) -> Any:
 
 def command_line() -> list[str]:
     """What a user has typed; of a sweep, what starts this run alone."""
-    options = HydraConfig.get().overrides.task if HydraConfig.initialized() else sys.argv[1:]
+    is_typed = not HydraConfig.initialized() or HydraConfig.get().mode == RunMode.RUN
+    options = sys.argv[1:] if is_typed else HydraConfig.get().overrides.task
     return ["python", sys.argv[0], *options]
 
 
