@@ -811,6 +811,13 @@ def test_standardised_scores_of_equal_samples_are_zero(dtype, standardised, cons
     assert (standardised(score, mask=mask.expand(3, 7)) == 0).all()
 
 
+@DTYPES
+@pytest.mark.parametrize("standardised", [standardised, standardised_in_batch])
+def test_standardised_scores_of_nan_are_nan(dtype, standardised):
+    score = torch.tensor([[math.nan, 1.0, 2.0], [0.0, 1.0, 2.0]], dtype=dtype)
+    assert standardised(score)[0].isnan().all()
+
+
 @PROPERTY
 @given(x=groups(k=5), scale=st.sampled_from([1e-30, 1e-3, 1.0, 1e30]), shift=st.floats(-9, 9))
 @pytest.mark.parametrize("standardised", [standardised, standardised_in_batch])

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import gc
 import pickle
 import random
 import re
+import weakref
 
 import pytest
 import torch
@@ -536,7 +538,13 @@ class TestSampler:
         with pytest.raises(ValueError, match="serves one storage, and this one has another"):
             other.extend(make_steps(TRAJECTORIES[:1]))
         assert buffer.sample()["group"].shape[:2] == (1, 2)
-        copied = pickle.loads(pickle.dumps(buffer.sampler))  # which has none yet
+        sampler, storage = buffer.sampler, weakref.ref(buffer.storage)
+        del buffer, other
+        gc.collect()
+        assert storage() is None
+        again = TensorDictReplayBuffer(storage=LazyTensorStorage(20), sampler=sampler)
+        again.extend(make_steps(TRAJECTORIES))
+        copied = pickle.loads(pickle.dumps(sampler))  # which has none yet
         fresh = TensorDictReplayBuffer(storage=LazyTensorStorage(20), sampler=copied)
         fresh.extend(make_steps(TRAJECTORIES))
 

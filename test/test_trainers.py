@@ -179,6 +179,15 @@ def test_learning_rates_are_those_that_are_named():
         assert_close(value, before[name] - rate)
 
 
+def test_a_learning_rate_of_its_own_changes_nothing_else():
+    trainer = Optimising(ECACLoss(**networks(ECACLoss)))
+    own = {"params": [*trainer.loss_module.parameters()], "eps": 1e-5, "weight_decay": 0.1}
+    trainer.optimizer = torch.optim.Adam([own], lr=1e-3)
+    trainers.LearningRates(actor_network=1e-2).register(trainer)
+    kept = [(one["lr"], one["eps"], one["weight_decay"]) for one in trainer.optimizer.param_groups]
+    assert kept == [(1e-3, 1e-5, 0.1), (1e-2, 1e-5, 0.1)]
+
+
 def test_wrong_learning_rates_are_refused():
     trainer = Optimising(ECACLoss(**networks(ECACLoss)))
     known = "the loss learns actor_network, log_tau, log_tau_prime, qvalue_network"
@@ -189,6 +198,9 @@ def test_wrong_learning_rates_are_refused():
     for rate in (-1, float("inf"), float("nan")):
         with pytest.raises(ValueError, match=rf"log_tau must be in \[0, inf\), got {rate}"):
             trainers.LearningRates(log_tau=rate)
+    trainer.optimizer = torch.optim.Adam([*trainer.loss_module.actor_network_params.parameters()])
+    with pytest.raises(ValueError, match="names log_tau, which the trainer's optimizer does not"):
+        trainers.LearningRates(log_tau=0.1).register(trainer)
     torch.optim.lr_scheduler.LambdaLR(trainer.optimizer, lambda step: 1.0)
     with pytest.raises(ValueError, match="register LearningRates before it is made"):
         trainers.LearningRates(log_tau=0.1).register(trainer)

@@ -415,6 +415,16 @@ class TestCheckpoints:
             (sequence, copies.state_dict(), "one entry, 'updaters', with 2 states"),
             (sequence, {"updaters": [copies.state_dict()]}, "one entry, 'updaters', with 2"),
             (
+                UpdaterSequence(PeriodicCopy(half.loss_module, "qvalue_network", interval=5), half),
+                {
+                    "updaters": [
+                        {"initialized": True, "counter": 3},
+                        {"initialized": True, "averages": None},
+                    ]
+                },
+                "averages must be",
+            ),
+            (
                 sequence,
                 {"updaters": [{"initialized": True, "counter": 7}, {"initialized": "no"}]},
                 "initialized must be",
@@ -422,6 +432,6 @@ class TestCheckpoints:
         ]
         for updater, state, message in refused:
             before = updater.state_dict()
-            with pytest.raises(ValueError, match=message):
+            with pytest.raises((ValueError, TypeError), match=message):
                 updater.load_state_dict(state)
             torch.testing.assert_close(updater.state_dict(), before)

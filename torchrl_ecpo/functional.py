@@ -1356,16 +1356,16 @@ def _spread(score: Tensor, *, sample_dim: int, mask: Tensor | None) -> Tensor:
     highest = score.detach().where(real, -math.inf).amax(sample_dim, keepdim=True)
     lowest = score.detach().where(real, math.inf).amin(sample_dim, keepdim=True)
     rounding = 8 * torch.finfo(distance.dtype).eps * torch.maximum(highest.abs(), lowest.abs())
-    return distance.where(highest - lowest > rounding, 0.0)
+    return distance.where(~(highest - lowest <= rounding), 0.0)  # NaN stays NaN
 
 
 def _in_deviations(distance: Tensor, *, sample_dim: int = -1, mask: Tensor | None) -> Tensor:
     """Distances in units of the root of their mean square; 0 where all are 0."""
     # Scaled by the largest distance, so that no square under- or overflows.
     largest = distance.abs().amax(sample_dim, keepdim=True)
-    unit = distance / largest.where(largest > 0, 1.0)
+    unit = distance / largest.where(largest != 0, 1.0)
     variance = masked_mean(unit.square(), sample_dim=sample_dim, mask=mask, keepdim=True)
-    return unit / variance.where(largest > 0, 1.0).sqrt()
+    return unit / variance.where(largest != 0, 1.0).sqrt()
 
 
 def _log_uniform(like: Tensor, dim: int, mask: Tensor | None) -> Tensor | float:

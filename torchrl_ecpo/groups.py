@@ -517,7 +517,7 @@ class TrajectoryGroupSampler(Sampler, metaclass=_KeepReplacement):
     def _find(self, storage: Storage) -> _Whole:
         self._attach(storage)
         filled, writers = len(storage), self._writers(storage)  # pyright: ignore[reportArgumentType]
-        state = (storage, filled, writers)
+        state = (filled, writers)
         if state != self._state:
             self._whole = self._scan(storage, filled, writers) if filled else _NOTHING
             self._state = state

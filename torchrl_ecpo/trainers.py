@@ -63,7 +63,8 @@ class LearningRates(TrainerHookBase):
 
     Raises:
         ValueError: for a rate that is no finite number >= 0 and, when registered, for a name of
-            nothing that the loss learns, without an optimiser, or after a learning-rate scheduler.
+            nothing that the loss learns or the optimiser holds, without an optimiser, or after a
+            learning-rate scheduler.
 
     Examples:
         >>> LearningRates(log_tau=1e-2, actor_network=1e-3).rates
@@ -93,11 +94,22 @@ class LearningRates(TrainerHookBase):
         if unknown := self.rates.keys() - learned.keys():
             known = ", ".join(sorted(learned))
             raise ValueError(f"LearningRates names {min(unknown)}; the loss learns {known}.")
-        moved = {id(parameter) for owner in self.rates for parameter in learned[owner]}
-        for group in optimizer.param_groups:
-            group["params"] = [one for one in group["params"] if id(one) not in moved]
-        for owner, rate in self.rates.items():
-            optimizer.add_param_group({"params": learned[owner], "lr": rate})
+        owners = {id(parameter): owner for owner in self.rates for parameter in learned[owner]}
+        groups = [*optimizer.param_groups]
+        if left := owners.keys() - {id(one) for group in groups for one in group["params"]}:
+            raise ValueError(
+                f"LearningRates names {min(owners[one] for one in left)}, which the trainer's "
+                "optimizer does not hold: make it of loss_module.parameters()."
+            )
+        for group in groups:
+            parts: dict[str | None, list[Any]] = {name: [] for name in (None, *self.rates)}
+            for parameter in group["params"]:
+                parts[owners.get(id(parameter))].append(parameter)
+            group["params"] = parts.pop(None)
+            for owner, parameters in parts.items():
+                if parameters:
+                    own = {"params": parameters, "lr": self.rates[str(owner)]}
+                    optimizer.add_param_group({**group, **own})
 
 
 def make_loss(loss_class: str, **options: Any) -> PolicyLoss:

@@ -375,7 +375,8 @@ class UpdaterSequence(TargetNetUpdater):
         """Restores the progress that :meth:`state_dict` returned.
 
         Raises:
-            ValueError: if it is not the state of a sequence of as many updaters of the same kinds.
+            ValueError, TypeError: if it is not the state of a sequence of as many updaters of the
+                same kinds.
         """
         states = state_dict.get("updaters", None)
         is_list = isinstance(states, (list, tuple)) and all(isinstance(x, Mapping) for x in states)
@@ -388,7 +389,7 @@ class UpdaterSequence(TargetNetUpdater):
         try:
             for updater, state in zip(self.updaters, states, strict=True):
                 updater.load_state_dict(state)
-        except ValueError:  # the state as a whole is refused
+        except (ValueError, TypeError):  # the state as a whole is refused
             for updater, state in zip(self.updaters, before, strict=True):
                 updater.load_state_dict(state)
             raise

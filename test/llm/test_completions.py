@@ -315,6 +315,7 @@ def test_dropout(model, config):
         ({"do_sample": True, "top_p": 0.9}, "top_p=0.9"),
         ({"do_sample": True, "num_beams": 4}, "num_beams=4.*Set it to 1 "),
         ({"do_sample": True, "no_repeat_ngram_size": 1}, "no_repeat_ngram_size=1.*Set it to 0 "),
+        ({"do_sample": True, "encoder_repetition_penalty": 2.0}, "penalty=2.0.*Set it to 1 "),
         ({"do_sample": True, "bad_words_ids": [[4]]}, "bad_words_ids=.*Set it to None "),
     ],
 )

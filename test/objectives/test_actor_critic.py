@@ -834,6 +834,11 @@ def test_value_estimators_that_are_no_use():
     network = ValueOperator(nn.Linear(OBSERVATION, 1), ["observation"])
     with pytest.raises(ValueError, match="TD0Estimator must have value_network=None"):
         loss.make_value_estimator(TD0Estimator(gamma=GAMMA, value_network=network))
+    for named in (TD0Estimator, ValueEstimators.TD0, "td0"):
+        with pytest.raises(ValueError, match=r"(TD0Estimator|TD0|td0) must have value_network=N"):
+            loss.make_value_estimator(named, gamma=GAMMA, value_network=network)
+    with pytest.raises(ValueError, match=r"TD0Estimator that is made has its own \['gamma'\]"):
+        loss.make_value_estimator(TD0Estimator(gamma=GAMMA, value_network=None), gamma=0.5)
     with pytest.raises(NotImplementedError, match=r"GAE is not implemented.*takes TD0Estimator"):
         loss.make_value_estimator(GAE(gamma=GAMMA, lmbda=0.9, value_network=None))
     with pytest.raises(NotImplementedError, match="GAE is not implemented"):
@@ -926,6 +931,20 @@ def test_the_lift_of_the_next_state_is_given_what_the_networks_read(monkeypatch)
     monkeypatch.setattr(loss, "lift", watched)
     loss.soft_bellman_target(_batch())
     assert given == [["observation"]]
+
+
+def test_an_integer_after_a_terminated_state_need_not_be_a_token():
+    batch = _batch(CASE)
+    batch["token"] = torch.zeros(len(batch), dtype=torch.int64)
+    batch["next", "token"] = torch.full((len(batch),), 3)
+    batch["next", "terminated"][1] = batch["next", "done"][1] = True
+    networks = make_networks()
+    embedding = nn.Sequential(nn.Embedding(10, 4), nn.Linear(4, 1)).double()
+    networks.value = ValueOperator(embedding, ["token"])
+    loss = CASE.build(networks, value=True)
+    expected = call(loss, batch)
+    batch["next", "token"][1] = -1
+    assert_close(call(loss, batch), expected)
 
 
 def test_skipped_states_keep_their_dtype():

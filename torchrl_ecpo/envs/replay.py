@@ -71,7 +71,7 @@ class EpisodeReplay(Transform):
     ) -> TensorDictBase:
         generator, before, self._before = self._generator(), self._before, None
         if generator is not before and isinstance(generator, np.random.Generator):  # of a seed
-            bits = generator.bit_generator
+            bits: Any = generator.bit_generator
             self._start = _as_text(type(bits)(bits.seed_seq).state)
         return tensordict_reset
 

@@ -31,6 +31,7 @@ NEUTRAL: Mapping[str, tuple[float | None, ...]] = {
     "top_p": (None, 1),
     "min_p": (None, 0),
     "repetition_penalty": (None, 1),
+    "encoder_repetition_penalty": (None, 1),
     "presence_penalty": (None, 0),
     "frequency_penalty": (None, 0),
     "typical_p": (None, 1),
@@ -38,9 +39,16 @@ NEUTRAL: Mapping[str, tuple[float | None, ...]] = {
     "eta_cutoff": (None, 0),
     "num_beams": (None, 1),
     "no_repeat_ngram_size": (None, 0),
+    "encoder_no_repeat_ngram_size": (None, 0),
+    "guidance_scale": (None, 1),
     "min_length": (None, 0),
     "min_new_tokens": (None, 0),
     "bad_words_ids": (None,),
+    "force_words_ids": (None,),
+    "forced_eos_token_id": (None,),
+    "sequence_bias": (None,),
+    "exponential_decay_length_penalty": (None,),
+    "watermarking_config": (None,),
 }
 
 

@@ -663,32 +663,37 @@ class ActorCriticLoss(PolicyLoss):
 
         Raises:
             NotImplementedError: for an estimator that needs more than values.
-            ValueError: for an estimator with a value network, and for a ``gamma`` or ``lmbda``
-                that is not in [0, 1].
+            ValueError: for an estimator with a value network, hyperparameters beside one that is
+                made, and a ``gamma`` or ``lmbda`` that is not in [0, 1].
         """
         for name in ("gamma", "lmbda"):
             if name in hyperparams:
                 hyperparams[name] = as_float(name, hyperparams[name], "[0, 1]")
         value_type = self.default_value_estimator if value_type is None else value_type
-        if isinstance(value_type, (ValueEstimators, str)):
-            supported = self.SUPPORTED_VALUE_ESTIMATORS
-            hyperparams = {"value_network": None, **hyperparams}
-            dispatch_value_estimator(self, value_type, supported=supported, **hyperparams)
+        network, name = hyperparams.get("value_network"), str(value_type)
+        if is_named := isinstance(value_type, (ValueEstimators, str)):
+            hyperparams["value_network"] = network
         else:
-            is_class = isinstance(value_type, type)
-            kind = value_type if is_class else type(value_type)
-            network = hyperparams.get("value_network") if is_class else value_type.value_network
+            kind = value_type if isinstance(value_type, type) else type(value_type)
+            name = kind.__name__
             if not issubclass(kind, ESTIMATORS):
                 takes = ", ".join(estimator.__name__ for estimator in ESTIMATORS)
                 raise NotImplementedError(
-                    f"{kind.__name__} is not implemented for {type(self).__name__}, which takes "
-                    f"{takes}."
+                    f"{name} is not implemented for {type(self).__name__}, which takes {takes}."
                 )
-            if network is not None:
-                raise ValueError(
-                    f"The {kind.__name__} must have value_network=None: the loss itself computes "
-                    "the soft value of the next state."
-                )
+            if isinstance(value_type, kind):
+                network = value_type.value_network
+                if hyperparams:
+                    raise ValueError(f"A {name} that is made has its own {sorted(hyperparams)}.")
+        if network is not None:
+            raise ValueError(
+                f"The {name} must have value_network=None: the loss itself computes the soft value "
+                "of the next state."
+            )
+        if is_named:
+            supported = self.SUPPORTED_VALUE_ESTIMATORS
+            dispatch_value_estimator(self, value_type, supported=supported, **hyperparams)
+        else:
             super().make_value_estimator(value_type, **hyperparams)  # pyright: ignore
         self._forward_value_estimator_keys()
         return self
@@ -888,9 +893,13 @@ def _saturation(action: Tensor, policy: Distribution) -> Tensor:
 
 
 def _blank(entry: Tensor, where: Tensor, *, only_strange: bool = False) -> Tensor:
-    """0 in these places, and True in a mask of actions; or only what is NaN or infinite there."""
+    """0 in these places, and True in a mask of actions; or only what no network could read there.
+
+    That is what is NaN or infinite, and all integers: one may be no token, and nothing tells.
+    """
     where = where.reshape(*where.shape, *(1,) * (entry.ndim - where.ndim))
-    where = where & ~entry.isfinite() if only_strange else where
+    if only_strange and (entry.is_floating_point() or entry.dtype == torch.bool):
+        where = where & ~entry.isfinite()
     return entry.masked_fill(where, entry.dtype == torch.bool)
 
 

@@ -115,12 +115,12 @@ class ECACLoss(ActorCriticLoss):
     at, whatever stands there. A locked batch keeps the ``"td_error"`` out, unless it has one.
 
     Raises:
-        ValueError: for discrete or hybrid actions, a Q network that reads no action, a value
-            network without delay, no samples, temperatures that are not allowed, an unknown or
-            ill-typed option, an odd number of actions in pairs, a width_entropy without
-            ``"gradient"``; when called, for a policy that is no Gaussian or a Q network without
-            a gradient where one is needed, a target_kl that M samples cannot show or a
-            target_entropy that no policy has, an entry of another shape or type or without a
+        ValueError: for discrete or hybrid actions, a Q network that reads no action,
+            ``delay_qvalue=True`` with a value network, no samples, temperatures that are not
+            allowed, an unknown or ill-typed option, an odd number of actions in pairs, a
+            width_entropy without ``"gradient"``; when called, for a policy that is no Gaussian or a
+            Q network without a gradient where one is needed, a target_kl that M samples cannot show
+            or a target_entropy that no policy has, an entry of another shape or type or without a
             transition, actions that are none, weights below 0, and NaN or infinite values.
         TypeError: if ``actor_network`` has no ``get_dist``.
         KeyError: when called, for a missing entry.
