@@ -620,7 +620,7 @@ class Stranger(Countdown):
         ({"group_size": 1}, ValueError, "group_size must be an integer of at least 2"),
         ({"num_groups": 0}, ValueError, "num_groups must be an integer of at least 1"),
         ({"group_size": 4}, ValueError, r"\[\*B, group_size=4\], got \(2, 3\)"),
-        ({"num_groups": 3}, ValueError, "num_groups=3 must be a multiple.*, 2"),
+        ({"num_groups": 3}, ValueError, "share of num_groups, 3, must be a multiple.*, 2"),
         ({"group_key": "instance"}, KeyError, "no .*instance.*GroupedEnv"),
         ({"frames_per_batch": 10}, TypeError, "frames_per_batch: a batch is counted in groups"),
         ({"init_random_frames": 10}, TypeError, "every action comes from the policy"),

@@ -108,7 +108,7 @@ SETTINGS = {
             "loss=ecpo loss.tau=0.25,1.0 seed=3",
             "loss=urex seed=4 env.curriculum=group optim.lr=0.003 optim.amsgrad=false",
             "loss=ment seed=3 project_steps=1 anneal_from=null evaluation.interval=15",
-            "loss=reps seed=4",
+            "loss=pmd seed=4",
         ),
     ),
     "epochs": (

@@ -32,8 +32,8 @@ class EpisodeReplay(Transform):
     differ from one to the next. Every task can play an episode again: the state dict holds the
     random generator's state before the last reset and the actions since; loading it resets and
     repeats them. That costs as much as the steps themselves. It is exact, because that generator is
-    all that is random in these tasks; a seed given to ``reset`` of a gymnasium task counts, what
-    else ``reset`` is given does not.
+    all that is random in these tasks. A seed given to ``reset`` counts, where the task draws from
+    gymnasium's own generator; what else ``reset`` is given does not.
 
     Only the simulator is put where it was: what an episode has summed or counted so far travels in
     the tensordict that the caller holds.
