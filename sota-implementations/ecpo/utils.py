@@ -65,10 +65,8 @@ def _problems(config: DictConfig, options: Sequence[str]) -> Iterator[str]:
     own = f"{given.get('env', 'bandit')}/{given.get('loss', 'ecpo')}"  # or what config.yaml has
     if given.get("form") == "paper" and not (PUBLISHED / f"{own}.yaml").is_file():
         files = [*PUBLISHED.glob("*/*.yaml")]
-        tasks, losses = (
-            sorted({file.parent.name for file in files}),
-            sorted({file.stem for file in files}),
-        )
+        tasks = sorted({file.parent.name for file in files})
+        losses = sorted({file.stem for file in files})
         yield (
             f"form=paper is for env= of {', '.join(tasks)} and loss= of {', '.join(losses)}; with "
             f"{own} it would change nothing. Leave out form."
