@@ -87,6 +87,7 @@ __all__ = [
     "uniform_weights",
     "urex_surrogate",
     "weighted_sum",
+    "widened",
 ]
 
 
@@ -154,6 +155,16 @@ def _check_samples(
                     f"{tuple(shape)}, got the shape {tuple(value.shape)}."
                 )
     return shape
+
+
+def widened(values: Tensor) -> Tensor:
+    """In single precision at least: what is added up, or divided by a small temperature.
+
+    Examples:
+        >>> widened(torch.tensor([300.0], dtype=torch.float16)).square()
+        tensor([90000.])
+    """
+    return values.to(torch.promote_types(values.dtype, torch.float32))
 
 
 def _axis(sample_dim: int, shape: torch.Size) -> int:

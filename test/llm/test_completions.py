@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from tensordict import lazy_stack
@@ -17,7 +19,7 @@ from torchrl.data.replay_buffers.samplers import PromptGroupSampler
 from torchrl.modules.distributions import LLMMaskedCategorical
 from torchrl.objectives.llm import GRPOLoss as TorchRLGRPOLoss
 from torchrl.objectives.llm import MCAdvantage
-from transformers import GPT2Config, GPT2LMHeadModel
+from transformers import GPT2Config, GPT2LMHeadModel, OPTConfig, OPTForCausalLM
 
 from torchrl_ecpo import (
     ECPOLoss,
@@ -210,6 +212,27 @@ def test_rewards_of_tokens_are_added_up(model):
     assert returns.tolist() == [[len(RESPONSES[i]) / 2 for i in members] for members in GROUPS]
 
 
+def test_rewards_of_padding_count_for_nothing(model):
+    """Of all tokens or of the response's; whatever stands there, NaN too."""
+    actor, batch = make(model, pad_output=True)
+    of_all = (batch[FULL] == END).float()
+    rewards = of_all.masked_fill(batch[FULL] == PAD, torch.nan)
+    of_response = rewards[:, batch[PROMPT].shape[-1] :]
+    for given in (rewards, of_response, of_response.unsqueeze(-1)):
+        batch["next", "reward"] = given
+        assert (RLOOLoss(actor)._read(batch).returns == 1).all()
+
+
+def test_rewards_in_half_precision_are_not_added_up_in_it(model):
+    actor, batch = make(model)
+    expected = torch.tensor([200.0 + i / 2 for i in range(6)])
+    for row, total in zip(batch.unbind(0), expected, strict=True):
+        row["next", "reward"] = torch.tensor([[100.0], [total - 100]]).bfloat16()
+    returns = RLOOLoss(actor)._read(batch).returns
+    assert returns.dtype == torch.float32
+    assert_close(returns, expected[torch.tensor(GROUPS)])
+
+
 def test_a_replay_buffer_of_torchrls(model):
     """PromptGroupSampler draws whole groups, rows of other lengths among them."""
     actor, batch = make(model)
@@ -293,6 +316,15 @@ def test_half_precision(model):
     assert losses["kl_reference_policy"] == 0
 
 
+def test_dropout_of_opt():
+    """Its rate is a number of the layer's, without a module."""
+    sizes = {"hidden_size": 32, "num_hidden_layers": 1, "ffn_dim": 64, "num_attention_heads": 2}
+    sizes |= {"vocab_size": len(tiny.WORDS), "word_embed_proj_dim": 32, "pad_token_id": PAD}
+    actor = tiny.make_actor(OPTForCausalLM(OPTConfig(**sizes)).train())
+    with pytest.raises(ValueError, match=r"drops out 10%.*model.eval"):
+        record_log_probs(actor, ragged(tiny.make_model()))
+
+
 @pytest.mark.parametrize("config", [{"attention_dropout": 0.1}, {}], ids=["rate", "module"])
 def test_dropout(model, config):
     dropping = tiny.make_model(**config).train()
@@ -313,10 +345,13 @@ def test_dropout(model, config):
         ({"do_sample": True, "temperature": 0.7}, "temperature=0.7"),
         ({"do_sample": True, "top_k": 5}, "top_k=5"),
         ({"do_sample": True, "top_p": 0.9}, "top_p=0.9"),
-        ({"do_sample": True, "num_beams": 4}, "num_beams=4.*Set it to 1 "),
-        ({"do_sample": True, "no_repeat_ngram_size": 1}, "no_repeat_ngram_size=1.*Set it to 0 "),
-        ({"do_sample": True, "encoder_repetition_penalty": 2.0}, "penalty=2.0.*Set it to 1 "),
-        ({"do_sample": True, "bad_words_ids": [[4]]}, "bad_words_ids=.*Set it to None "),
+        ({"do_sample": True, "num_beams": 4}, "num_beams=4.*num_beams = 1."),
+        (
+            {"do_sample": True, "no_repeat_ngram_size": 1},
+            "no_repeat_ngram_size=1.*_size = 0.",
+        ),
+        ({"do_sample": True, "encoder_repetition_penalty": 2.0}, "penalty=2.0.*_penalty = 1."),
+        ({"do_sample": True, "bad_words_ids": [[4]]}, "bad_words_ids=.*bad_words_ids = None."),
     ],
 )
 def test_other_distributions(settings, words):
@@ -330,6 +365,16 @@ def test_other_distributions(settings, words):
             ECPOLoss(actor)
 
 
+@pytest.mark.parametrize("setting", [{"top_h": 0.4}, {"begin_suppress_tokens": [4]}])
+def test_other_distributions_of_the_model(setting):
+    """What the wrapper does not pass on."""
+    model = tiny.make_model()
+    sampler = tiny.make_sampler(model)
+    model.generation_config.update(**setting)
+    with pytest.raises(ValueError, match=f"{next(iter(setting))} = None."):
+        check_sampler(sampler)
+
+
 def test_padding_that_ends_a_completion_is_not_drawn():
     """As of models with several ends, one of which is the padding."""
     model = tiny.make_model()
@@ -337,7 +382,24 @@ def test_padding_that_ends_a_completion_is_not_drawn():
     model.generation_config.eos_token_id = [1, 0]
     check_sampler(sampler)
     model.generation_config.suppress_tokens = None
-    message = r"padding token, 0, is among .*eos_token_id=\[1, 0\].*suppress_tokens=\[0\]"
+    message = r"padding token, 0, is among .*eos_token_id=\[1, 0\].*suppress_tokens = \[0\]"
+    with pytest.raises(ValueError, match=message):
+        check_sampler(sampler)
+    model.generation_config.eos_token_id = 1
+    check_sampler(sampler)
+    sampler.generate_kwargs["eos_token_id"] = [1, 0]
+    with pytest.raises(ValueError, match=message):
+        check_sampler(sampler)
+
+
+@pytest.mark.parametrize("of_model", [True, False])
+def test_the_model_pads_with_the_tokenizers_padding(of_model):
+    """Else transformers pads with the end of a completion, which counts as a token."""
+    model = tiny.make_model(pad_token_id=None if of_model else PAD)
+    sampler = tiny.make_sampler(model)
+    if not of_model:
+        sampler.generate_kwargs["pad_token_id"] = END
+    message = "pad_token_id=(None|1) .*the tokenizer with 0.*generation_config.pad_token_id = 0"
     with pytest.raises(ValueError, match=message):
         check_sampler(sampler)
 
@@ -345,11 +407,30 @@ def test_padding_that_ends_a_completion_is_not_drawn():
 def test_a_model_that_the_wrapper_calls_wrongly():
     """GPT-2's second argument is its cache, which fails inside of transformers."""
     sizes = {"n_embd": 32, "n_layer": 1, "n_head": 2, "vocab_size": len(tiny.WORDS)}
-    sizes |= {"bos_token_id": None, "eos_token_id": END}
+    sizes |= {"bos_token_id": None, "eos_token_id": END, "pad_token_id": PAD}
     model = GPT2LMHeadModel(GPT2Config(**sizes))
     message = "GPT2LMHeadModel.forward takes [a-z_]+ where TorchRL's wrapper passes"
+    sampler = tiny.make_sampler(model)
     with pytest.raises(ValueError, match=message):
-        check_sampler(tiny.make_sampler(model))
+        check_sampler(sampler)
+    sampler.model = InPEFT(model)
+    with pytest.raises(ValueError, match=message):
+        check_sampler(sampler)
+
+
+class InPEFT(nn.Module):
+    """The interface of PEFT's wrapper of a model, whose own second argument is the mask."""
+
+    def __init__(self, model):
+        super().__init__()
+        self.model, self.config = model, model.config
+        self.generation_config = model.generation_config
+
+    def get_base_model(self):
+        return self.model
+
+    def forward(self, input_ids, attention_mask):
+        return self.model(input_ids, attention_mask=attention_mask)
 
 
 def test_a_compiled_model_is_looked_into():
@@ -367,6 +448,15 @@ def test_top_k_of_transformers():
         check_sampler(tiny.make_actor(model, generate=True, generate_kwargs=settings))
     model.generation_config.top_k = 0
     check_sampler(tiny.make_actor(model, generate=True, generate_kwargs=settings))
+
+
+def test_top_k_beside_a_vocabulary_that_a_part_of_the_config_has():
+    """As of models of texts and images."""
+    model = tiny.make_model()
+    sampler = tiny.make_actor(model, generate=True, generate_kwargs={"do_sample": True})
+    model.config = SimpleNamespace(get_text_config=lambda: SimpleNamespace(vocab_size=51))
+    with pytest.raises(ValueError, match="top_k=50"):
+        check_sampler(sampler)
 
 
 # --------------------------------------------------------------------------------- bad input
@@ -420,18 +510,31 @@ def test_mixed_rows(model):
         ECPOLoss(actor)(batch.reshape(2, 3))
 
 
+@pytest.mark.parametrize("lazy", [False, True])
+def test_padding_that_the_actor_strips(model, lazy):
+    """Its log-probabilities are then of rows without padding, padded anew on the left."""
+    batch = dense(ragged(model))
+    batch = batch.to_lazystack(0) if lazy else batch
+    with pytest.raises(ValueError, match=r"padded, which .* strips.*pad_output=True"):
+        ECPOLoss(tiny.make_actor(model))(batch)
+    with pytest.raises(ValueError, match=r"padded, which .* strips.*pad_output=True"):
+        record_log_probs(tiny.make_actor(model), batch)
+    groups = RLOOLoss(tiny.make_actor(model, pad_output=True))._read(batch)
+    assert_close(groups.log_prob, groups.behaviour_log_prob, rtol=1e-4, atol=1e-4)
+
+
 def test_other_tokens(model, monkeypatch):
-    """A mask of another shape, as of a text that is divided anew."""
+    """A mask of another shape, as of a wrapper that evaluates others."""
     actor, batch = make(model, pad_output=True)
     loss_module = ECPOLoss(actor)
     loss_module.set_keys(action=("tokens", "other"))
     batch["tokens", "other"] = batch[FULL][:, 1:]
-    with pytest.raises(ValueError, match="divided into other tokens"):
+    with pytest.raises(ValueError, match=r"7 tokens, but .* others than were sampled"):
         loss_module(batch)
     divided = actor.get_dist(batch, mask_key=("masks", "all_attention_mask"), padding_side="left")
     monkeypatch.setattr(actor, "get_dist", lambda *_, **__: divided)
     batch[FULL] = batch["tokens", "other"]
-    with pytest.raises(ValueError, match="divided into other tokens"):
+    with pytest.raises(ValueError, match=r"8 tokens, but .* others than were sampled"):
         record_log_probs(actor, batch)
 
 
@@ -440,6 +543,8 @@ def test_other_tokens(model, monkeypatch):
     [
         ({"generate": True}, "generate=False"),
         ({"input_key": PROMPT}, "a prompt without its completion"),
+        ({"input_mode": "text"}, "input_mode='text'.*input_mode='tokens'"),
+        ({"pad_model_input": False}, "packs the rows"),
         ({"tokenizer": tiny.make_tokenizer(pad_token=None)}, "no padding token"),
         ({"tokenizer": tiny.make_tokenizer(pad_token="<end>")}, "no padding token"),
     ],

@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import LazyStackedTensorDict, TensorDictBase
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import cross_entropy
 
 from torchrl_ecpo.checks import (
@@ -23,6 +23,7 @@ from torchrl_ecpo.checks import (
     present,
     values_can_be_seen,
 )
+from torchrl_ecpo.functional import widened
 
 # What leaves the policy's own distribution as it is, by name of the sampler's setting.
 NEUTRAL: Mapping[str, tuple[float | None, ...]] = {
@@ -35,6 +36,7 @@ NEUTRAL: Mapping[str, tuple[float | None, ...]] = {
     "presence_penalty": (None, 0),
     "frequency_penalty": (None, 0),
     "typical_p": (None, 1),
+    "top_h": (None,),
     "epsilon_cutoff": (None, 0),
     "eta_cutoff": (None, 0),
     "num_beams": (None, 1),
@@ -44,6 +46,7 @@ NEUTRAL: Mapping[str, tuple[float | None, ...]] = {
     "min_length": (None, 0),
     "min_new_tokens": (None, 0),
     "bad_words_ids": (None,),
+    "begin_suppress_tokens": (None,),
     "force_words_ids": (None,),
     "forced_eos_token_id": (None,),
     "sequence_bias": (None,),
@@ -78,6 +81,18 @@ def check_actor(actor: Any) -> None:
             "end-of-sequence token, and the end of a completion would count for nothing). Set "
             "tokenizer.pad_token to a token that is never sampled."
         )
+    mode = getattr(actor, "input_mode", "tokens")
+    if mode != "tokens":
+        raise ValueError(
+            f"The actor has input_mode={mode!r}: it would divide texts into tokens anew, which may "
+            "be others than were sampled. Build it with input_mode='tokens'; the sampler writes "
+            "them, whatever it reads."
+        )
+    if not getattr(actor, "pad_model_input", True):
+        raise ValueError(
+            "The actor packs the rows into one (pad_model_input=False), where TorchRL's mask lets "
+            "tokens see those after them. Leave out pad_model_input."
+        )
     _check_settings(_settings(actor))
 
 
@@ -94,8 +109,9 @@ def check_sampler(sampler: Any) -> None:
         ValueError: for greedy decoding (the default of transformers), a temperature other than 1,
             top-k (by default, transformers draws from the 50 likeliest tokens), top-p, min-p,
             beams, penalties and what else changes probabilities, be it the wrapper's or of the
-            model's ``generation_config``; where the padding token is one of those that end a
-            completion there; and for a model that the wrapper calls wrongly, such as GPT-2.
+            model's ``generation_config``; where the model pads with another token than the
+            tokenizer, or with one that ends a completion; and for a model that the wrapper calls
+            wrongly, such as GPT-2.
 
     Examples:
         >>> from types import SimpleNamespace
@@ -116,9 +132,9 @@ def check_sampler(sampler: Any) -> None:
                 "The sampler decodes greedily: all completions of a prompt would be the same. Add "
                 "do_sample=True to its generate_kwargs."
             )
-        if settings["top_k"] >= sampler.model.config.vocab_size:
+        if settings["top_k"] >= sampler.model.config.get_text_config().vocab_size:
             settings["top_k"] = 0
-        _check_ends(sampler, config)
+        _check_padding(sampler, config)
         _check_arguments(sampler.model)
     _check_settings(settings)
 
@@ -126,6 +142,7 @@ def check_sampler(sampler: Any) -> None:
 def _check_arguments(model: Any) -> None:
     """Refuse a model whose attention mask TorchRL's wrapper would pass for something else."""
     model = getattr(model, "_orig_mod", model)  # which torch.compile wraps
+    model = model.get_base_model() if hasattr(model, "get_base_model") else model  # of PEFT
     second = [*inspect.signature(model.forward).parameters.values()][1:2]
     named = [one.name for one in second if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)]
     if named not in ([], ["attention_mask"]):
@@ -136,16 +153,28 @@ def _check_arguments(model: Any) -> None:
         )
 
 
-def _check_ends(sampler: Any, config: Any) -> None:
-    """Refuse padding that ends a completion: it would be drawn, and count for nothing."""
+def _check_padding(sampler: Any, config: Any) -> None:
+    """Refuse padding that would count as a token, and tokens that would count as padding."""
     padding = getattr(getattr(sampler, "tokenizer", None), "pad_token_id", None)
-    ends = getattr(config, "eos_token_id", None)
-    ends = ends if isinstance(ends, (list, tuple)) else [ends]
-    suppressed = getattr(config, "suppress_tokens", None) or ()
-    if padding is not None and padding in ends and padding not in suppressed:
+    if padding is None:
+        return
+    options = sampler.generate_kwargs or {}
+    given = {
+        name: options.get(name, getattr(config, name, None))
+        for name in ("pad_token_id", "eos_token_id", "suppress_tokens")
+    }
+    if given["pad_token_id"] != padding:
         raise ValueError(
-            f"The padding token, {padding}, is among generation_config.eos_token_id={ends}: an end "
-            f"of a completion would count for nothing: set its suppress_tokens=[{padding}]."
+            f"The model pads with pad_token_id={given['pad_token_id']} (None: the end of a "
+            f"completion), the tokenizer with {padding}: padding would count as sampled. Set "
+            f"model.generation_config.pad_token_id = {padding}."
+        )
+    ends = given["eos_token_id"]
+    ends = ends if isinstance(ends, (list, tuple)) else [ends]
+    if padding in ends and padding not in (given["suppress_tokens"] or ()):
+        raise ValueError(
+            f"The padding token, {padding}, is among eos_token_id={ends}: an end of a completion "
+            f"would count for nothing. Set model.generation_config.suppress_tokens = [{padding}]."
         )
 
 
@@ -163,9 +192,9 @@ def _check_settings(settings: Mapping[str, Any]) -> None:
         if settings[name] not in neutral:
             raise ValueError(
                 f"The sampler has {name}={settings[name]}, so that it draws from another "
-                "distribution than the model's own, which the loss takes the policy to be. Set it "
-                f"to {neutral[1] if len(neutral) > 1 else None} in the sampler's options or, with "
-                "transformers, in model.generation_config."
+                "distribution than the model's own, which the loss takes the policy to be. Leave "
+                "it out of the sampler's options; with transformers, also set "
+                f"model.generation_config.{name} = {neutral[1] if len(neutral) > 1 else None}."
             )
 
 
@@ -208,8 +237,7 @@ def record_log_probs(actor: Any, tensordict: TensorDictBase) -> TensorDictBase:
     check_actor(actor)
     _check_dropout(actor)
     rows = tensordict.reshape(-1)
-    logits, attention = _logits(actor, rows)
-    tokens = _tokens(rows, (actor.tokens_key, "full"), attention)
+    logits, attention, tokens = _evaluate(actor, rows, (actor.tokens_key, "full"))
     log_prob = _log_prob(logits, tokens, _with_context(attention, attention))
     key = (actor.log_probs_key, "full")
     lengths = [len(row) for row in _entries(rows, (actor.tokens_key, "full"))]
@@ -237,7 +265,8 @@ def read_completions(
         tensordict: completions ``[B]``, groups of which `prompt_key` tells, or groups ``[*G, K]``.
         tokens_key: prompt and completion.
         log_prob_key: their recorded log-probabilities.
-        reward_key: of a completion, or of its tokens, which are added up.
+        reward_key: of a completion, or of its tokens (all, or those of the response), which are
+            added up; those of padding count for nothing.
         prompt_key: text, integer or tokens, equal within a group only.
         mask_key: which tokens are the policy's own. ``"auto"``: those after the prompt; None: all.
 
@@ -248,11 +277,8 @@ def read_completions(
     """
     _check_dropout(actor)
     rows, members = tensordict.reshape(-1), _members(tensordict, prompt_key)
-    returns = _padded(rows, reward_key, 0.0)
-    check_real(reward_key, returns)
-    returns = returns.reshape(len(returns), -1).sum(-1)
-    logits, attention = _logits(actor, rows)
-    tokens = _tokens(rows, tokens_key, attention)
+    logits, attention, tokens = _evaluate(actor, rows, tokens_key)
+    returns = _returns(rows, reward_key, (actor.tokens_key, "prompt"), attention)
     if mask_key == "auto":
         mask = attention & _after_prompt(rows, tokens, tokens_key, (actor.tokens_key, "prompt"))
     elif mask_key is None:
@@ -329,16 +355,41 @@ def _entries(rows: Any, key: NestedKey) -> Any:
     return rows.get(key, None, as_list=True)
 
 
-def _tokens(rows: TensorDictBase, key: NestedKey, attention: Tensor) -> Tensor:
-    """The tokens ``[B, L]``, which must be those that the actor has evaluated."""
+def _returns(rows: Any, key: NestedKey, prompt_key: NestedKey, attention: Tensor) -> Tensor:
+    """The returns ``[B]``, in single precision at least: equal ones must not come of rounding."""
+    rewards = _padded(rows, key, 0.0)
+    rewards = widened(rewards).flatten(1)
+    width, length = rewards.shape[-1], attention.shape[-1]
+    prompts = _entries(rows, prompt_key)
+    of_response = length - max(len(prompt) for prompt in prompts) if prompts is not None else length
+    if width in (length, of_response):
+        rewards = rewards.where(attention[:, length - width :], 0.0)
+    check_real(key, rewards)
+    return rewards.sum(-1)
+
+
+def _evaluate(actor: Any, rows: TensorDictBase, key: NestedKey) -> tuple[Tensor, Tensor, Tensor]:
+    """Logits ``[B, L, V]`` of each token given those before it, which are real, and the tokens."""
     tokens = _padded(rows, key, 0)
+    is_padding = tokens == actor.tokenizer.pad_token_id
+    elsewhere = (
+        f"Rows of {key!r} are padded, which the actor strips (pad_output=False), so that its "
+        "log-probabilities would be of other tokens. Build it with pad_output=True."
+    )
+    strips = not getattr(actor, "pad_output", True)
+    stacked = isinstance(rows, LazyStackedTensorDict)  # what the wrapper then returns
+    if strips and not stacked and values_can_be_seen() and is_padding.any():
+        raise ValueError(elsewhere)
+    logits, attention = _logits(actor, rows)
     if tokens.shape != attention.shape:
         raise ValueError(
             f"The actor evaluates {attention.shape[-1]} tokens, but {key!r} has "
-            f"{tokens.shape[-1]}: a text was divided into other tokens than those that were "
-            "sampled. Build the actor with input_mode='tokens'."
+            f"{tokens.shape[-1]}: others than were sampled, or rows are padded, which it strips; "
+            "then build it with pad_output=True."
         )
-    return tokens
+    if values_can_be_seen() and (attention & is_padding).any():
+        raise ValueError(elsewhere)
+    return logits, attention, tokens
 
 
 def _logits(actor: Any, rows: TensorDictBase) -> tuple[Tensor, Tensor]:
@@ -397,9 +448,7 @@ def _log_prob(logits: Tensor, tokens: Tensor, mask: Tensor) -> Tensor:
 
     In single precision at least. Only their logits are taken: prompts and padding cost nothing.
     """
-    own = logits[mask]
-    own = own.to(torch.promote_types(own.dtype, torch.float32))
-    log_prob = -cross_entropy(own, tokens[mask], reduction="none")
+    log_prob = -cross_entropy(widened(logits[mask]), tokens[mask], reduction="none")
     return log_prob.new_zeros(mask.shape).masked_scatter(mask, log_prob)
 
 
@@ -431,10 +480,12 @@ def _recorded(recorded: Tensor, key: NestedKey, log_prob: Tensor, mask: Tensor) 
 def _check_dropout(actor: Any) -> None:
     """Refuse dropout: the policy that sampled had other units than the one that is evaluated."""
     for name, module in actor.named_modules():
-        rate = (
-            module.p if isinstance(module, nn.Dropout) else getattr(module, "attention_dropout", 0)
-        )
-        if module.training and isinstance(rate, float) and rate > 0:
+        # Some keep their rate as a number, without a module: OPT for example.
+        is_dropout = "Dropout" in type(module).__name__
+        numbers = {key: x for key, x in vars(module).items() if isinstance(x, float)}
+        rates = [x for key, x in numbers.items() if "drop" in key or (is_dropout and key == "p")]
+        rate = max(rates, default=0.0)
+        if module.training and rate > 0:
             raise ValueError(
                 f"The actor's {name!r} drops out {rate:.0%} of its units, so that its "
                 "log-probabilities are not those of the policy that sampled. Call model.eval(), "

@@ -41,6 +41,7 @@ from torchrl_ecpo.functional import (
     standardised,
     standardised_in_batch,
     uniform_weights,
+    widened,
 )
 from torchrl_ecpo.groups import DONE_KEY, GROUP_KEY
 from torchrl_ecpo.llm.completions import check_actor, is_language_model, read_completions
@@ -417,7 +418,7 @@ class TrajectoryGroupLoss(PolicyLoss):
         def real(values: Tensor) -> Tensor:
             # A sum over a completion of 1,000 tokens would be off by nats in half precision, and
             # returns that differ by little would be equal.
-            values = values.to(torch.promote_types(values.dtype, torch.float32))
+            values = widened(values)
             return values if mask is None else values.where(mask, 0.0)
 
         recorded = self._recorded_log_prob(tensordict, shape)
