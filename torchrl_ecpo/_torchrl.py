@@ -13,10 +13,12 @@ from torchrl.data.replay_buffers import ReplayBuffer, Storage
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
+from torchrl.objectives.value import ValueEstimatorBase
 
 PRIVATE_NAMES: tuple[tuple[object, str], ...] = (
     (LossModule, "_all_schedulable_buffers"),
     (LossModule(), "_has_update_associated"),  # of each instance
+    (ValueEstimatorBase, "_get_time_dim"),
     (EnvBase, "_step_proc_data"),  # overridden by environments of ours: saves a tenth of a step
     (Storage, "_attached_entities"),
     (Sampler, "_rng"),
@@ -41,6 +43,11 @@ def networks_with_updater(loss_module: LossModule) -> dict[str, bool]:
     TorchRL's own constructor marks all of them, and there is no public name for one.
     """
     return loss_module._has_update_associated
+
+
+def time_dim_of(estimator: ValueEstimatorBase, tensordict: TensorDictBase) -> int:
+    """Along which dimension an estimator follows a trajectory: its own, or what the names tell."""
+    return estimator._get_time_dim(None, tensordict)
 
 
 def buffers_of(storage: Storage) -> list[ReplayBuffer]:
@@ -71,7 +78,7 @@ def holding(network: Any, params: Any) -> Iterator[None]:
     with params.to_module(network, preserve_module_state=False):
         try:
             yield
-        except Exception as caught:
+        except BaseException as caught:  # Ctrl-C too
             error = caught
     if error is not None:
         raise error

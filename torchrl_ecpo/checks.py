@@ -128,8 +128,13 @@ def check_padding(keys: Sequence[NestedKey], mask: Tensor) -> None:
 
 
 def values_can_be_seen() -> bool:
-    """Whether tensors have values to check: not while being compiled, nor within ``torch.vmap``."""
-    return not (torch.compiler.is_compiling() or is_transformed())
+    """Whether tensors have values to check: not while compiled, captured or in ``torch.vmap``."""
+    return not (torch.compiler.is_compiling() or is_transformed() or is_captured())
+
+
+def is_captured() -> bool:
+    """Whether a CUDA graph is being captured, which replays no Python and may not wait."""
+    return torch.cuda.is_initialized() and torch.cuda.is_current_stream_capturing()
 
 
 def get_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:

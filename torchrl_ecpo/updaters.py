@@ -57,7 +57,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule, TargetNetUpdater
 
 from torchrl_ecpo._torchrl import networks_with_updater
-from torchrl_ecpo.checks import as_float, check_count, check_flag, check_kind
+from torchrl_ecpo.checks import as_float, check_count, check_flag, check_kind, is_captured
 
 __all__ = ["PeriodicCopy", "PolyakAverage", "UpdaterSequence"]
 
@@ -211,6 +211,11 @@ class PeriodicCopy(_NetworkUpdater):
         self.counter = 0
 
     def _is_due(self) -> bool:
+        if is_captured():
+            raise RuntimeError(
+                "PeriodicCopy counts its calls, which a CUDA graph would not replay: call step() "
+                "outside of the graph."
+            )
         self.counter += 1
         # Not "==": a run may be resumed with an interval shorter than the count it was saved with.
         if self.counter < self.interval:

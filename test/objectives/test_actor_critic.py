@@ -7,6 +7,9 @@ import math
 import pickle
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
+from typing import Any
+from unittest import mock
 
 import pytest
 import torch
@@ -397,6 +400,18 @@ def test_an_error_leaves_the_networks_as_they_were(case):
     deepcopy(loss)
 
 
+def test_an_interrupt_comes_through(monkeypatch):
+    """As it is, and not as an error of the data; the networks are the loss's again."""
+    loss, batch = CASE.build(), _batch()
+    network, stop = loss.actor_network, KeyboardInterrupt()
+    before = [*map(id, network.parameters())]
+    monkeypatch.setattr(network, "get_dist", mock.Mock(side_effect=stop))
+    with pytest.raises(KeyboardInterrupt) as raised:
+        loss(batch)
+    assert raised.value is stop
+    assert [*map(id, network.parameters())] == before
+
+
 DEFAULTS = {
     "reduction": "mean",
     "loss_function": "l2",
@@ -704,15 +719,7 @@ def test_forbidden_actions_have_no_part(name, distribution, tau):
 
 def test_padding_forbids_no_action():
     """In a transition that is not real all actions may be taken, or the policy would be NaN."""
-    case, networks = CASES["discrete_ecac"], make_networks("categorical")
-    networks.actor = ProbabilisticActor(
-        networks.actor[0],
-        {"logits": "logits", "mask": "action_mask"},
-        distribution_class=MaskedCategorical,
-    )
-    loss, batch = case.build(networks, delay_actor=False), _batch(case)
-    for where in (batch, batch["next"]):
-        where["action_mask"] = torch.ones(6, CHOICES, dtype=torch.bool)
+    loss, batch = _masked("discrete_ecac", CHOICES, delay_actor=False)
     batch[MASK] = torch.arange(6) < 5
     outputs = call(loss, batch)
     assert outputs["entropy"].isfinite()
@@ -722,21 +729,15 @@ def test_padding_forbids_no_action():
 # ------------------------------------------------------------------------------ masks and weights
 
 
-class _SharedNoise:
+def _shared_noise():
     """Noise that depends on the place in the batch of six alone."""
+    noise = torch.randn(16, 6, ACTION, generator=torch.Generator().manual_seed(0)).double()
 
-    def __enter__(self):
-        self.original = torch.distributions.Normal.rsample
-        noise = torch.randn(16, 6, ACTION, generator=torch.Generator().manual_seed(0)).double()
+    def rsample(normal, sample_shape=()):
+        batch = normal.loc.shape[0]
+        return normal.loc + normal.scale * noise[: sample_shape[0]].repeat(1, 2, 1)[:, :batch]
 
-        def rsample(normal, sample_shape=()):
-            batch = normal.loc.shape[0]
-            return normal.loc + normal.scale * noise[: sample_shape[0]].repeat(1, 2, 1)[:, :batch]
-
-        torch.distributions.Normal.rsample = rsample
-
-    def __exit__(self, *_):
-        torch.distributions.Normal.rsample = self.original
+    return mock.patch.object(torch.distributions.Normal, "rsample", rsample)
 
 
 @losses
@@ -754,7 +755,7 @@ def test_masked_transitions_count_nothing(case, weighted):
             spoilt[key][8:] = math.inf
     mask = torch.arange(12) < 6
     spoilt[MASK] = mask.unsqueeze(-1) if weighted else mask
-    with _SharedNoise():
+    with _shared_noise():
         expected, actual = loss(real), loss(spoilt)
         outputs = case.build(**LEARNED, reduction="none")(spoilt)
     assert_close(actual, expected)
@@ -822,6 +823,36 @@ def test_value_estimators(estimator, options, lmbda, lengths):
         reward, done, terminated = (following[name][n, :length, 0] for name in names)
         expected = _td_lambda(reward, values[n, :length], done, terminated, lmbda)
         assert_close(actual[n, :length], expected)
+
+
+@pytest.mark.parametrize("told", ["names", "time_dim"])
+@pytest.mark.parametrize("masked", [False, True])
+def test_time_may_be_another_dimension(told, masked):
+    """Trajectories ``[T, N]`` have the targets of ``[N, T]``, with a mask too."""
+    batch = _batch(CASE, 3, 6)
+    if masked:
+        batch[MASK] = torch.arange(6) < torch.tensor([[4], [6], [1]])
+    values = torch.randn(3, 6, generator=torch.Generator().manual_seed(3)).double()
+    options: dict[str, Any] = {"gamma": GAMMA, "lmbda": 0.6}
+
+    def targets(batch, values, **own):
+        loss = _fixed_next_value(CASE.build(), values)
+        loss.make_value_estimator(ValueEstimators.TDLambda, **options, **own)
+        return loss.double().soft_bellman_target(*loss._read(batch))
+
+    expected = targets(batch, values)
+    turned, own = batch.transpose(0, 1).contiguous(), {"time_dim": 0}
+    if told == "names":
+        turned.names, own = ["time", None], {}
+    assert_close(targets(turned, values.T, **own).T, expected)
+
+
+def test_rewards_are_not_standardised_over_masked_ones():
+    loss, batch = CASE.build(), _batch()
+    batch[MASK] = torch.arange(6) < 4
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA, average_rewards=True)
+    with pytest.raises(ValueError, match="average_rewards=True counts the rewards that a mask"):
+        loss.double()(batch)
 
 
 def test_value_estimators_that_are_no_use():
@@ -969,7 +1000,7 @@ def test_num_actor_states(case, n):
     batch = _batch(case)
     batch["priority_weight"] = WEIGHTS
     batch[MASK] = torch.arange(6) != 2
-    with _SharedNoise():
+    with _shared_noise():
         actual = case.build(**options, num_actor_states=n)(batch)
         whole = case.build(**options)(batch)
         first = case.build(**options)(batch[:n].clone())
@@ -1224,6 +1255,28 @@ def test_wrong_discrete_actions(action, message):
         case.build()(_batch(case).set("action", action))
 
 
+def test_a_mask_of_indices_is_refused():
+    """MaskedCategorical takes one, but Q has the values of all n actions."""
+    loss, batch = _masked("discrete_ecac", CHOICES)
+    network: Any = loss.actor_network[-1]
+    network.distribution_class = partial(_by_indices, MaskedCategorical)
+    with pytest.raises(ValueError, match=r"MaskedCategorical with indices: give it a boolean mask"):
+        loss(batch)
+
+
+def _by_indices(kind, logits, mask):
+    return kind(logits=logits, indices=torch.arange(CHOICES).expand_as(logits))
+
+
+@pytest.mark.parametrize("dtype", [torch.bool, torch.int64, torch.float64])
+def test_a_single_action_may_be_one_hot(dtype):
+    case, batch = CASES["discrete_ecac"], _batch(CASES["discrete_ecac"])
+    qvalues = torch.zeros(2, 6, 1).double()
+    one = torch.full((6, 1), dtype != torch.int64, dtype=dtype)  # the index is 0
+    chosen = case.build()._chosen_qvalue(qvalues, batch.set("action", one), None)
+    assert chosen.shape == (2, 6)
+
+
 @pytest.mark.parametrize(
     ("name", "allowed", "target"),
     [
@@ -1353,6 +1406,36 @@ def test_extremes_stay_finite(case, scale, value, dtype):
 
 
 # ----------------------------------------------------------------------------------------- compile
+
+
+@losses
+def test_half_precision_has_room_for_the_lift(case):
+    """Q of 800 at temperatures of 0.02: what is divided is beyond the numbers of 16 bits."""
+    networks = make_networks(case.kind, dtype=torch.float16)
+    for qvalue in networks.qvalues:
+        last = [module for module in qvalue.modules() if isinstance(module, nn.Linear)][-1]
+        last.bias.data += 800
+    batch = _batch(case, dtype=torch.float16)
+    given = {"tau": 0.02, "tau_prime": 0.005, "reduction": "none"}
+    half, whole = (
+        case.build(deepcopy(networks), **given).to(dtype)
+        for dtype in (torch.float16, torch.float32)
+    )
+    in_single = batch.apply(lambda x: x.float() if x.is_floating_point() else x)
+    outputs, expected = call(half, batch), call(whole, in_single)
+    assert_close(outputs["state_value"], expected["state_value"], atol=0.5, rtol=0)
+    assert outputs["loss_qvalue"].dtype == torch.float32
+    many = _batch(case, 256, dtype=torch.float16)
+    many[MASK] = torch.arange(256) < 255
+    assert call(case.build(deepcopy(networks)).half(), many)["qvalue"] == pytest.approx(800, abs=2)
+
+
+def test_vmap_randomness_may_be_chosen():
+    """As of TorchRL's losses; here nothing is vmapped."""
+    loss, batch = CASE.build(), _batch()
+    expected = call(loss, batch)
+    loss.set_vmap_randomness("different")
+    assert_close(call(loss, batch), expected)
 
 
 def _dense(wrap=lambda network: network, **options):

@@ -241,20 +241,20 @@ def test_a_tanh_policy_is_projected_as_the_gaussian_below_it():
     assert_close(*outputs)
 
 
-def test_policy_that_is_no_gaussian():
-    """The paper's projection takes it."""
-
-    class PositiveBeta(Independent):
-        def __init__(self, loc, scale) -> None:
-            super().__init__(Beta(loc.exp(), scale), 1)
-
+def not_gaussian():
+    """Networks whose policy is a Beta distribution."""
     networks = make_networks()
     networks.actor = ProbabilisticActor(
         networks.actor[0],  # type: ignore
         in_keys=["loc", "scale"],
-        distribution_class=PositiveBeta,
+        distribution_class=lambda loc, scale: Independent(Beta(loc.exp(), scale), 1),
     )
-    loss = CASE.build(networks, projection="paper")
+    return networks
+
+
+def test_policy_that_is_no_gaussian():
+    """The paper's projection takes it."""
+    loss = CASE.build(not_gaussian(), projection="paper")
     outputs = call(loss, make_batch())
     assert all(output.isfinite() for output in outputs.values())
     grads = gradients(loss, outputs["loss_actor"])
@@ -383,14 +383,8 @@ def test_the_gradient_of_q_is_not_for_inference_mode():
 
 def test_what_has_no_gradient():
     """A policy that is no Gaussian, and a critic that is not differentiable in the action."""
-    networks = make_networks()
-    networks.actor = ProbabilisticActor(
-        networks.actor[0],  # type: ignore
-        in_keys=["loc", "scale"],
-        distribution_class=lambda loc, scale: Independent(Beta(loc.exp(), scale), 1),
-    )
     with pytest.raises(ValueError, match=r"needs a diagonal Gaussian.*got Independent"):
-        call(CASE.build(networks, **PAIRED), make_batch())
+        call(CASE.build(not_gaussian(), **PAIRED), make_batch())
     loss = gaussian_bandit(torch.Tensor.detach, distribution=TanhNormal, **PAIRED)
     with pytest.raises(ValueError, match=r"qvalue_network that is differentiable in the action"):
         loss.project(loss.states(states(3)))

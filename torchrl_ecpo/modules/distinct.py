@@ -44,7 +44,7 @@ class Evaluated(NamedTuple):
 class DistinctCore(TensorDictModuleBase):
     """Base class: reads categorical inputs, and evaluates each distinct past once.
 
-    A core implements :meth:`evaluate`, and says in :attr:`state_specs` what travels from step to
+    A core implements :meth:`evaluate`, and says in :meth:`state_specs` what travels from step to
     step. See :class:`DistinctHistoryLSTM` and :class:`DistinctWindowNetwork`.
     """
 

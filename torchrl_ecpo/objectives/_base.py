@@ -26,7 +26,7 @@ from torchrl_ecpo.checks import (
     present,
     values_can_be_seen,
 )
-from torchrl_ecpo.functional import check_temperatures, temperature_dual
+from torchrl_ecpo.functional import check_temperatures, temperature_dual, widened
 
 REDUCTIONS = ("none", "mean", "sum")
 
@@ -254,6 +254,9 @@ class PolicyLoss(LossModule):
         self._out_keys = None
         return self
 
+    def _make_vmap(self) -> None:
+        """Nothing: networks are called one by one, each with draws of its own."""
+
     def set_keys(self, **kwargs: Any) -> None:
         """Rename entries of the input, see :class:`_AcceptedKeys`; None is the default name."""
         super().set_keys(**kwargs)
@@ -409,6 +412,7 @@ class Reduction(NamedTuple):
 
     def loss(self, values: Tensor) -> Tensor:
         """Of values ``[*B]``, or of one number."""
+        values = widened(values)
         if values.shape != self.shape:
             return values.expand(self.shape) if self.kind == "none" else values
         if self.mask is not None:
@@ -431,6 +435,7 @@ class Reduction(NamedTuple):
 
     def mean(self, values: Tensor) -> Tensor:
         """Over the real states, without weights."""
+        values = widened(values)
         if self.mask is None:
             return values.mean()
         return values.where(self.mask, 0.0).sum() / self.mask.sum().clamp_min(1)

@@ -24,6 +24,7 @@ from torchrl_ecpo.functional import (
     lifted_log_weights,
     log_mean_exp,
     soft_value,
+    widened,
 )
 from torchrl_ecpo.modules.latents import split
 
@@ -195,9 +196,15 @@ class AllActions(NamedTuple):
     @classmethod
     def of(cls, distribution: Any) -> AllActions:
         """All actions of a categorical or one-hot policy."""
-        log_prob = distribution.logits.log_softmax(-1).movedim(-1, 0)
+        log_prob = widened(distribution.logits).log_softmax(-1).movedim(-1, 0)
         is_out = log_prob == -torch.inf
-        mask = getattr(distribution, "mask", None)
+        try:
+            mask = getattr(distribution, "mask", None)
+        except ValueError as error:
+            raise ValueError(
+                f"The policy is a {type(distribution).__name__} with indices: give it a boolean "
+                "mask of all n actions, which the Q network values."
+            ) from error
         if mask is not None:  # TorchRL's, which may fill in what is finite
             is_out = is_out | ~mask.expand_as(distribution.logits).movedim(-1, 0)
         # Minus infinity times 0 would be NaN.

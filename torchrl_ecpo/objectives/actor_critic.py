@@ -25,7 +25,7 @@ from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
 from torchrl.objectives.value import TD0Estimator, TD1Estimator, TDLambdaEstimator
 from torchrl.objectives.value.advantages import ValueEstimatorBase
 
-from torchrl_ecpo._torchrl import holding
+from torchrl_ecpo._torchrl import holding, time_dim_of
 from torchrl_ecpo.checks import (
     UNREADABLE,
     as_float,
@@ -42,6 +42,7 @@ from torchrl_ecpo.functional import (
     Surrogate,
     effective_sample_size,
     self_normalised_weights,
+    widened,
 )
 from torchrl_ecpo.objectives._base import PolicyLoss, Reduction
 from torchrl_ecpo.objectives.actions import (
@@ -368,7 +369,7 @@ class ActorCriticLoss(PolicyLoss):
         states = self.states(transitions, mask)
         if not self._reads_action:  # the network has valued all actions: it is not asked twice
             first = qvalues.detach()[:, : self.num_actor_states]
-            states.make_lift = partial(self._lift_of_all, first)
+            states.make_lift = partial(self.lift, qvalue_params=first)
         surrogate = self.project(states)
         own = {name: x for name, x in surrogate.metrics.items() if name != "kl_target_reference"}
         self._check_declared(surrogate.losses, own)
@@ -409,7 +410,7 @@ class ActorCriticLoss(PolicyLoss):
         self,
         observations: TensorDictBase,
         reference: Distribution,
-        qvalue_params: TensorDictParams | None = None,
+        qvalue_params: TensorDictParams | Tensor | None = None,
         num_samples: int | None = None,
     ) -> Lift:
         """Lift the reference policy at each state ``[*B]``: Eq. 8, by samples or over all actions.
@@ -417,7 +418,8 @@ class ActorCriticLoss(PolicyLoss):
         Args:
             observations: what the Q network reads beside the action.
             reference: the policy at these states.
-            qvalue_params: of the Q networks; those that are trained by default.
+            qvalue_params: of the Q networks; those that are trained by default. Or the values
+                ``[N, *B, n]`` of all n actions, where they are known.
             num_samples: M; ``num_action_samples`` by default.
         """
         number = self.num_action_samples if num_samples is None else num_samples
@@ -425,13 +427,6 @@ class ActorCriticLoss(PolicyLoss):
         with torch.no_grad():
             actions = actions_of(reference, number)
             return self.lifted(actions, self.score_of(observations, actions, params))
-
-    def _lift_of_all(self, qvalues: Tensor, _: TensorDictBase, reference: Distribution) -> Lift:
-        """The same, of a policy over n actions, whose values ``[N, *B, n]`` are known."""
-        with torch.no_grad():
-            actions = actions_of(reference, 1)
-            self._check_kind(isinstance(actions, AllActions))
-            return self.lifted(actions, qvalues.amin(0).movedim(-1, 0))
 
     def lifted(self, actions: Actions, score: Tensor, slope: Tensor | None = None) -> Lift:
         """The lift, of actions that have been valued."""
@@ -442,6 +437,7 @@ class ActorCriticLoss(PolicyLoss):
                 "know the same actions, and an action of several numbers has one "
                 "log-probability, as with torch.distributions.Independent or TanhNormal."
             )
+        actions = actions._replace(log_prob=widened(actions.log_prob))
         log_weights, value = actions.lift(score, *self.temperatures())
         weights = self_normalised_weights(log_weights, sample_dim=0)
         if not self.has_soft_value:
@@ -449,9 +445,15 @@ class ActorCriticLoss(PolicyLoss):
         return Lift(actions, score, log_weights, weights, value, slope)
 
     def score_of(
-        self, observations: TensorDictBase, actions: Actions, qvalue_params: TensorDictParams
+        self,
+        observations: TensorDictBase,
+        actions: Actions,
+        qvalue_params: TensorDictParams | Tensor,
     ) -> Tensor:
-        """The least of the soft Q values ``[M, *B]`` of actions at each state ``[*B]``."""
+        """The least of the soft Q values ``[M, *B]`` of actions at each state ``[*B]``.
+
+        The arguments are those of :meth:`lift`.
+        """
         self._check_kind(isinstance(actions, AllActions))
         observations = observations.select(*self._qvalue_observations)
         if not isinstance(actions, SampledActions):
@@ -525,8 +527,14 @@ class ActorCriticLoss(PolicyLoss):
             valued = tensordict.copy()
             valued.set(unravel_key(("next", self.tensor_keys.value)), value)
             if mask is not None and mask.ndim:
+                if getattr(self.value_estimator, "average_rewards", False):
+                    raise ValueError(
+                        "A value estimator with average_rewards=True counts the rewards that a "
+                        "mask leaves out too. Leave out average_rewards, or the masked transitions."
+                    )
                 # What is not real follows on nothing: TD(1) and TD(lambda) look no further.
-                is_followed = (mask & mask.roll(-1, -1)).unsqueeze(-1)
+                time = time_dim_of(self.value_estimator, valued)
+                is_followed = (mask & mask.roll(-1, time)).unsqueeze(-1)
                 done = unravel_key(("next", self.tensor_keys.done))
                 valued.set(done, tensordict.get(done) | ~is_followed)
             return self.value_estimator.value_estimate(valued).squeeze(-1)
@@ -559,7 +567,8 @@ class ActorCriticLoss(PolicyLoss):
         if self._reads_action:
             return qvalues
         action = tensordict.get(self.tensor_keys.action)
-        is_index = qvalues.shape[-1] == 1 and not action.is_floating_point()  # of the one action
+        no_index = action.is_floating_point() or action.dtype == torch.bool
+        is_index = qvalues.shape[-1] == 1 and not no_index  # of the one action
         if action.shape == qvalues.shape[1:] and not is_index:
             is_one = action == 1
             is_strange = (is_one.sum(-1) != 1) | (is_one != (action != 0)).any(-1)
@@ -567,7 +576,6 @@ class ActorCriticLoss(PolicyLoss):
             return (qvalues * action).sum(-1)
         if action.shape == (*qvalues.shape[1:-1], 1):
             action = action.squeeze(-1)
-        no_index = action.is_floating_point() or action.dtype == torch.bool
         if action.shape != qvalues.shape[1:-1] or no_index:
             raise ValueError(
                 f"The action {self.tensor_keys.action!r} must be one-hot of shape "
@@ -588,8 +596,14 @@ class ActorCriticLoss(PolicyLoss):
                 f"{int(is_strange.sum())} of {is_strange.numel()} are not."
             )
 
-    def _qvalues(self, inputs: TensorDictBase, params: TensorDictParams) -> Tensor:
-        """Soft Q of each of the N networks: ``[N, *B]``, or of all actions, ``[N, *B, n]``."""
+    def _qvalues(self, inputs: TensorDictBase, params: TensorDictParams | Tensor) -> Tensor:
+        """Soft Q of each of the N networks: ``[N, *B]``, or of all actions, ``[N, *B, n]``.
+
+        In single precision at least: half has no room for what is squared, or divided by a small
+        tau + tau'.
+        """
+        if isinstance(params, Tensor):  # which are known
+            return params
         network = self.qvalue_network
         name = "state_action_value" if self._reads_action else "action_value"
         key = getattr(self.tensor_keys, name)
@@ -601,6 +615,7 @@ class ActorCriticLoss(PolicyLoss):
                 with holding(network, each):
                     outputs.append(_written(network(inputs.copy()), name, key, network))
             qvalues = torch.stack(outputs)
+        qvalues = widened(qvalues)
         if not self._reads_action:
             return qvalues
         if qvalues.shape[-1] != 1:
@@ -617,7 +632,7 @@ class ActorCriticLoss(PolicyLoss):
         observations = observations.select(*network.in_keys)
         with holding(network, params):
             outputs = network(observations)
-        return _written(outputs, "value", self.tensor_keys.value, network).squeeze(-1)
+        return widened(_written(outputs, "value", self.tensor_keys.value, network).squeeze(-1))
 
     @property
     def _knows_each(self) -> bool:
@@ -770,7 +785,8 @@ class ActorCriticLoss(PolicyLoss):
         several_steps = self.value_estimator.tensor_keys.steps_to_next_obs
         further = (self.tensor_keys.priority_weight, several_steps)
         read = tensordict.select(*self._all_in_keys, *further, strict=False)
-        transitions: Any = read.apply(only_real, batch_size=shape)
+        names = read.names if read.shape == shape else None  # which may tell where time is
+        transitions: Any = read.apply(only_real, batch_size=shape, names=names)
         return transitions, mask
 
     def _priority_weights(self, tensordict: TensorDictBase, mask: Tensor | None) -> Tensor | None:

@@ -95,7 +95,7 @@ class PMDACLoss(ActorCriticLoss):
             log_target = states.lift.log_weights.log_softmax(0)
             divergence = actions.mean(actions.log_prob - log_target)
             return Surrogate((tau + tau_prime) * divergence, states.lift.weights)
-        score = self.score_of(states.observations, actions, self.qvalue_network_params.data)
+        score = self.score_of(states.observations, actions, self.qvalue_network_params.detach())
         loss = tau_prime * actions.log_prob - score
         if states.reference is not states.policy:  # which does not differ from itself
             loss = loss + tau * (actions.log_prob - actions.log_prob_of(states.reference))
