@@ -46,11 +46,8 @@ TINY = (
 LOSSES = ("ecac", "pmd_ac", "mpo", "sac", "sac_score", "tqc", "crossq", "td3", "ddpg")
 
 
-def start(directory, *overrides):
-    flags = [override for override in overrides if override.startswith("--")]
-    options = [override for override in overrides if override not in flags]
-    afresh = any(option in ("compile=true", "collector=ray") for option in options)
-    return run_script(directory, SCRIPT / "ecac.py", *flags, *options, afresh=afresh)
+def start(directory, *options):
+    return run_script(directory, SCRIPT / "ecac.py", *options, afresh="compile=true" in options)
 
 
 def tiny(overrides):
@@ -305,6 +302,15 @@ def test_a_game_of_minatar_and_fewer_updates_than_frames(tmp_path, train):
         (["env=pendulum", "loss=discrete_ecac"], "loss=discrete_ecac does not go with"),
         (["env=dm_control", "env.task=fly"], "env.name=cheetah env.task=fly cannot be made"),
         (["loss=crossq", "critic=layer_norm"], "critic=layer_norm does not go with loss=crossq"),
+        (["loss=sac", "loss.target_entropy=null"], "target_entropy=null does not go with loss=sac"),
+        (
+            ["env=cartpole", "loss=discrete_ecac", "loss.exploration=0.1"],
+            "loss.exploration is noise",
+        ),
+        (
+            ["env=cartpole", "loss=discrete_sac", "loss.value_network=true"],
+            "loss.value_network=true does not go with loss=discrete_sac",
+        ),
         (["~optim.lr.log_tau"], "optim.lr must have a learning rate for each of"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
@@ -312,6 +318,7 @@ def test_a_game_of_minatar_and_fewer_updates_than_frames(tmp_path, train):
 def test_bad_options_end_with_a_clear_message(utils, overrides, message):
     config = configure([*tiny(overrides), *overrides])
     with pytest.raises(ValueError, match=message):  # noqa: PT012 - the script's first steps
+        utils.check_config(config)
         env = utils.make_environment(config, seed=0)
         loss_module = utils.make_loss(config, utils.make_actor(config, env), env)
         utils.make_optimizer(config.optim, loss_module)
@@ -360,6 +367,10 @@ def test_pixels_are_read_by_networks_of_convolutions(utils, monkeypatch):
     (losses["loss_actor"] + losses["loss_qvalue"]).backward()
     for name, parameter in loss_module.named_parameters():
         assert name.startswith("log_tau") or parameter.grad.isfinite().all()
+    Screen.action_space = gym.spaces.Box(-1, 1, (2,))
+    for loss in ("crossq", "sac_score"):
+        with pytest.raises(ValueError, match=f"loss={loss} does not read pixels"):
+            utils.check_config(configure(["env=gym", "env.name=Screen", f"loss={loss}"]))
 
 
 def test_a_missing_simulator_is_named_with_its_extra(utils, monkeypatch):

@@ -11,7 +11,6 @@ import os
 import re
 import shutil
 import sys
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -48,12 +47,6 @@ def start(directory, *overrides):
 def run_ecpo(directory, *options):
     process = start(directory, *options)
     assert process.returncode == 0, process.stderr
-
-
-@pytest.fixture
-def script(beside):
-    """Imports what is beside the script."""
-    return partial(beside, "ecpo")
 
 
 @pytest.fixture
@@ -98,6 +91,25 @@ def test_a_sweep_leaves_a_directory_for_each_run(sweep, loss):
 @pytest.mark.parametrize("loss", [loss for loss in LOSSES if loss not in SWEPT])
 def test_every_other_loss_trains_on_the_bandit(tmp_path, train, loss):
     check_lifts(train(tmp_path, f"loss={loss}", *LIFTS))
+
+
+def test_a_loss_of_ones_own(tmp_path, script, monkeypatch):
+    """By its import path, from a configuration beside it."""
+    (tmp_path / "mine.py").write_text(
+        "from torchrl_ecpo import ECPOLoss\n\n\nclass MyLoss(ECPOLoss):\n    pass\n"
+    )
+    (tmp_path / "loss").mkdir()
+    (tmp_path / "loss/mine.yaml").write_text("name: mine\nclass: mine.MyLoss\ntau: 0.5\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    options = ("--config-dir", str(tmp_path), "loss=mine", *TINY)
+    process = run_script(tmp_path, ECPO, *options, afresh=True)
+    assert process.returncode == 0, process.stderr
+    (run,) = tmp_path.glob("runs/*/mine/seed_0/*")
+    assert json.loads((run / "summary.json").read_text())["finished"] is True
+    loss_class = script("utils").loss_class
+    for name, reason in (("mine.Nothing", "Nothing"), ("json.JSONDecoder", "such as mine.MyLoss")):
+        with pytest.raises(ValueError, match=rf"loss.class must be a loss over groups.*{reason}"):
+            loss_class(OmegaConf.create({"name": "mine", "class": name}))
 
 
 def check_lifts(metrics):

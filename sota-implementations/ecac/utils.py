@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 from crossq import make_renormalised_critic
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from score_sac import ScoreSACLoss
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
@@ -108,6 +108,28 @@ def check_config(config: DictConfig, options: Sequence[str] = ()) -> None:
     """Refuse options that do not go together."""
     with closing(make_environment(config, seed=config.seed)) as env:
         make_actor(config, env)
+        has_pixels = not isinstance(_observation_size(env), int)
+    if problems := [*_problems(config.loss, config.critic, has_pixels)]:
+        raise ValueError("\n".join(f"{problem}." for problem in problems))
+
+
+def _problems(loss: DictConfig, critic: str, has_pixels: bool) -> Iterator[str]:
+    if loss.name == "crossq" and critic != "plain":
+        yield (
+            f"critic={critic} does not go with loss=crossq, whose critics normalise by batches: "
+            "leave it out"
+        )
+    if loss.name in ("crossq", "sac_score") and has_pixels:
+        yield f"loss={loss.name} does not read pixels: take loss=sac or another"
+    if "alpha_init" in loss and loss.target_entropy is None:
+        yield (
+            f"loss.target_entropy=null does not go with loss={loss.name}, which learns its "
+            "temperature: give a number, in nats, or auto"
+        )
+    if loss.actor == "categorical" and loss.exploration is not None:
+        yield "loss.exploration is noise on numbers, not on one discrete action: leave it out"
+    if loss.name == "discrete_sac" and loss.value_network:
+        yield "loss.value_network=true does not go with loss=discrete_sac: leave it out"
 
 
 # ------------------------------------------------------------------------------------ environments
@@ -175,11 +197,6 @@ def make_loss(config: DictConfig, actor: TensorDictModuleBase, env: EnvBase) -> 
     if isinstance(action_spec, Categorical):
         critics = [make_action_value_network(_observation_size(env), action_spec.n, **sizes)]
     elif config.loss.name == "crossq":
-        if config.critic != "plain":
-            raise ValueError(
-                f"critic={config.critic} does not go with loss=crossq, whose critics normalise by "
-                "batches: leave it out."
-            )
         dimensions = _observation_size(env), action_spec.shape[-1]
         critics = [make_renormalised_critic(*dimensions, config.hidden_sizes)]
     else:
@@ -191,7 +208,7 @@ def make_loss(config: DictConfig, actor: TensorDictModuleBase, env: EnvBase) -> 
     options = {str(k): value for k, value in config.loss.items() if k not in OF_THE_SCRIPT}
     for name in TEMPERATURES:
         if isinstance(options.get(name), DictConfig):
-            options[name] = make_schedule(_plain(options[name]))(0)
+            options[name] = make_schedule(options[name])(0)
     if options.get("tau_prime") == 0 and "target_entropy" in options:  # no entropy
         options["target_entropy"] = None
     if "reference_interval" in config.loss:
@@ -231,7 +248,7 @@ def make_temperatures(config: DictConfig, loss_module: LossModule) -> Temperatur
     """Schedules of the temperatures that have one, counted in frames."""
     settings = {name: config.get(name) for name in TEMPERATURES}
     schedules = {
-        name: make_schedule(_plain(setting))
+        name: make_schedule(setting)
         for name, setting in settings.items()
         if isinstance(setting, DictConfig)
     }
@@ -301,10 +318,6 @@ def _observation_size(env: EnvBase) -> Any:
 
 def _half_range(action_spec: Any) -> Tensor:
     return (action_spec.space.high - action_spec.space.low) / 2
-
-
-def _plain(setting: DictConfig) -> Any:
-    return OmegaConf.to_container(setting, resolve=True)
 
 
 # --------------------------------------------------------------------------------------------- data

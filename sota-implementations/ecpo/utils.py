@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from tasks import Metrics, Task
 from tensordict import TensorDictBase
@@ -195,12 +196,19 @@ def has_value_network(config: DictConfig) -> bool:
 
 
 def loss_class(config: DictConfig) -> type[TrajectoryGroupLoss]:
-    """The one that ``loss.class`` names; of the oldest, ``loss.name``."""
-    found = LOSSES.get(config.name) or getattr(torchrl_ecpo, str(config.get("class")), None)
+    """The one that ``loss.class`` names, here or by its import path; of the oldest, its name."""
+    name = str(config.get("class"))
+    found = LOSSES.get(config.name) or getattr(torchrl_ecpo, name, None)
+    reason = ""
+    if found is None and "." in name:
+        try:
+            found = get_class(name)
+        except Exception as error:  # of Hydra or of the module itself
+            reason = f": {error}"
     if not (isinstance(found, type) and issubclass(found, TrajectoryGroupLoss)):
         raise ValueError(
-            "loss.class must be a loss over groups of torchrl_ecpo, such as GRPOLoss, got "
-            f"{config.get('class')!r}."
+            "loss.class must be a loss over groups: one of torchrl_ecpo, such as GRPOLoss, or the "
+            f"import path of another, such as mine.MyLoss, got {name!r}{reason}."
         )
     return found
 
@@ -219,9 +227,7 @@ def total_loss(losses: TensorDictBase, loss_module: TrajectoryGroupLoss) -> torc
 
 def make_temperatures(config: DictConfig, loss_module: TrajectoryGroupLoss) -> TemperatureScheduler:
     """Schedules of the temperatures, counted in trajectories; they begin at once."""
-    settings = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(settings, dict)
-    schedules = {name: make_schedule(settings[name]) for name in TEMPERATURES if name in settings}
+    schedules = {name: make_schedule(config[name]) for name in TEMPERATURES if name in config}
     return TemperatureScheduler(loss_module, **schedules)
 
 
