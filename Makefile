@@ -25,7 +25,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 install: $(VENV)/.installed ## make .venv with everything that is tested
 
 DEMO := 'stack=["loss=ecpo seed=1,2,3","loss=urex loss.tau=0.5 loss.score=batch epochs=4 seed=1,2,3",$\
-	"loss=dr_grpo loss.clip_epsilon=0.15 loss.score=batch epochs=4 seed=1,2,3"]'
+	"loss=dr_grpo loss.clip_epsilon=0.15 loss.score=batch optim.lr=0.01 epochs=4 max_kl=0.3 seed=1,2,3"]'
 
 demo: install ## compare ECPO, UREX and Dr.GRPO on Reverse, and ECPO, UREX and MENT on the 10,000-armed bandit
 	$(RUN) sota-implementations/ecpo/ecpo.py env=reverse $(DEMO) total_trajectories=56000 \

@@ -11,8 +11,7 @@ time.
 
 from __future__ import annotations
 
-import statistics
-import time
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -20,6 +19,7 @@ import numpy as np
 import torch
 from common import read_arguments, write_csv
 from gymnasium.spaces import Discrete, MultiDiscrete
+from loop import take_turns
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, GymWrapper, SerialEnv
 
@@ -87,11 +87,9 @@ def act(tensordict: TensorDictBase) -> TensorDictBase:
     return tensordict.set("action", (uniform * torch.tensor(NVEC)).long())
 
 
-def seconds(env: EnvBase, num_steps: int) -> float:
-    """Processor time of one step of one episode."""
-    start = time.process_time()
-    steps = env.rollout(num_steps, act, break_when_any_done=False)
-    return (time.process_time() - start) / steps.numel()
+def play(env: EnvBase, num_steps: int) -> int:
+    """Roll out; how many steps of single episodes."""
+    return env.rollout(num_steps, act, break_when_any_done=False).numel()
 
 
 def main() -> None:
@@ -107,13 +105,9 @@ def main() -> None:
     envs: dict[str, EnvBase] = {f"AlgorithmicEnv, {batched.numel()} episodes": batched}
     for copies in arguments.copies:
         envs[f"SerialEnv of {copies} GymWrapper"] = make_python(copies, arguments.min_length)
-    times: dict[str, list[float]] = {name: [] for name in envs}
-    for repeat in range(arguments.repeats + 1):
-        for name, env in envs.items():
-            taken = seconds(env, arguments.steps)
-            if repeat:
-                times[name].append(taken)
-    medians = {name: statistics.median(seen) for name, seen in times.items()}
+    loops = [partial(play, env, arguments.steps) for env in envs.values()]
+    processor, _, steps = take_turns(loops, arguments.repeats)
+    medians = {name: ms / 1e3 / n for name, ms, n in zip(envs, processor, steps, strict=True)}
     fastest = next(iter(medians.values()))
     print(f"{'':32} {'steps/s':>9}  {'batched is':>10}")
     for name, taken in medians.items():

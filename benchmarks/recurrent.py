@@ -11,13 +11,13 @@ every step; "share" is the part of all histories that is distinct.
 
 from __future__ import annotations
 
-import statistics
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
 from common import read_arguments, write_csv
+from loop import take_turns
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
@@ -78,19 +78,21 @@ def make_histories(groups: int, rollouts: int, steps: int, branch: float) -> Ten
     ).reshape(-1, steps)
 
 
-def sample(policy: ProbabilisticActor, data: TensorDict) -> None:
-    """Step through the data as a collector does."""
+def sample(policy: ProbabilisticActor, data: TensorDict) -> int:
+    """Step through the data as a collector does; how many steps."""
     states = TensorDict(batch_size=data.shape[:1])
     with torch.no_grad():
         for inputs in data.unbind(1):
             states = policy(inputs.copy().update(states))["next"].select(*STATES)
+    return data.numel()
 
 
-def update(policy: ProbabilisticActor, data: TensorDict) -> None:
-    """One forward and backward pass."""
+def update(policy: ProbabilisticActor, data: TensorDict) -> int:
+    """One forward and backward pass; over how many steps."""
     with set_recurrent_mode(True):
         dist = policy.get_dist(data.copy())
     dist.log_prob(data["action"]).sum().backward()
+    return data.numel()
 
 
 def count_distinct(data: TensorDict) -> int:
@@ -98,23 +100,6 @@ def count_distinct(data: TensorDict) -> int:
     inputs = torch.cat([data["observation"].unsqueeze(-1), data["previous_action"]], -1)
     steps = range(1, data.shape[1] + 1)
     return sum(len(inputs[:, :t].flatten(1).unique(dim=0)) for t in steps)
-
-
-def medians(
-    run: Callable[[ProbabilisticActor, TensorDict], None],
-    policies: list[ProbabilisticActor],
-    data: TensorDict,
-    repeats: int,
-) -> list[float]:
-    """Median times of policies that take turns, in milliseconds."""
-    times: list[list[float]] = [[] for _ in policies]
-    for repeat in range(repeats + 1):
-        for policy, seen in zip(policies, times, strict=True):
-            start = time.process_time()
-            run(policy, data)
-            if repeat:
-                seen.append(1e3 * (time.process_time() - start))
-    return [statistics.median(seen) for seen in times]
 
 
 def main() -> None:
@@ -144,7 +129,8 @@ def main() -> None:
             data = make_histories(arguments.groups, arguments.rollouts, steps, branch)
             share = count_distinct(data) / data.numel()
             sampling, updating = (
-                medians(run, policies, data, arguments.repeats) for run in (sample, update)
+                take_turns([partial(run, one, data) for one in policies], arguments.repeats)[0]
+                for run in (sample, update)
             )
             cells = [f"{steps:5d}  {branch:6.2f}  {share:5.2f}"]
             for plain, distinct in (sampling, updating):

@@ -4,20 +4,23 @@ import importlib
 import inspect
 import multiprocessing
 import sys
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
+from hypothesis import settings
 from omegaconf import OmegaConf
+from processes import FORKED
 from torch import multiprocessing as torch_multiprocessing
 
 from torchrl_ecpo.experiment import compose_options
 
-# pytest's importlib mode does not make a test's neighbours importable.
-sys.path.insert(0, str(Path(__file__).parent))
-from processes import FORKED
+# The same examples at every run, and none kept.
+settings.register_profile("tests", derandomize=True, deadline=None, database=None, max_examples=25)
+settings.load_profile("tests")
 
 SCRIPTS = Path(__file__).parents[1] / "sota-implementations"
 STUDY = SCRIPTS / "study"
@@ -69,6 +72,12 @@ def beside(monkeypatch):
 
     yield load
     forget_scripts()
+
+
+@pytest.fixture
+def script(beside):
+    """Imports what is beside ecpo.py."""
+    return partial(beside, "ecpo")
 
 
 @pytest.fixture

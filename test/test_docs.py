@@ -33,13 +33,7 @@ PAGES_WITH_DEFAULTS = [
 ECPO_CONFIG = ROOT / "sota-implementations/ecpo/config"
 ECAC_CONFIG = ROOT / "sota-implementations/ecac/config"
 MUJOCO_TASKS = ("hopper", "walker2d", "halfcheetah", "ant", "humanoid")
-ALGORITHMIC_TASKS = {
-    "copy": "Copy",
-    "duplicated_input": "DuplicatedInput",
-    "repeat_copy": "RepeatCopy",
-    "reverse": "Reverse",
-    "reversed_addition": "ReversedAddition",
-}
+ALGORITHMIC_TASKS = ("copy", "duplicated_input", "repeat_copy", "reverse", "reversed_addition")
 # Second column of a table of defaults: the configurations that it speaks of. They are those of the
 # loss of that name, or else of the loss that the page is named after, or else of ECPO; of ecpo.py
 # with the form and policy of the first study, but for the recipe's own.
@@ -199,7 +193,8 @@ def test_the_settings_that_the_search_chose_are_those_of_the_configuration():
     optimisers = dict(re.findall(r"\*\*(\w+)\*\*: .*`(optim\.amsgrad=\S+ optim\.eps=\S+)`", text))
     assert set(optimisers) == {"batch", "group"}
     losses, cell = ("ecpo", "pmd", "pmd_entropy", "urex", "ment"), r" \| `(\S+)`"
-    for task, title in ALGORITHMIC_TASKS.items():
+    for task in ALGORITHMIC_TASKS:
+        title = task.title().replace("_", "")
         stated = {
             option: values
             for option, *values in re.findall(

@@ -420,20 +420,3 @@ def test_comparison_refuses_runs_that_cannot_be_compared(runs):
         run.log({"return": float("nan")}, step=10)
     with pytest.raises(ValueError, match=r"late has no value of 'return' yet"):
         load_comparison(find_runs([runs / "late"]), "return")
-
-
-@pytest.mark.parametrize(
-    ("make", "error", "message"),
-    [
-        (lambda runs: find_runs([runs / "nowhere"]), FileNotFoundError, "no run .*nowhere"),
-        (lambda runs: load_comparison(find_runs([runs]), "reward"), KeyError, "no metric 'reward'"),
-        (
-            lambda runs: load_comparison(find_runs([runs]), "return", by=["loss.kind"]),
-            KeyError,
-            "no entry 'loss.kind'",
-        ),
-    ],
-)
-def test_comparison_refuses_what_is_not_there(runs, make, error, message):
-    with pytest.raises(error, match=message):
-        make(runs)

@@ -51,7 +51,6 @@ from torchrl_ecpo.functional import (
 )
 
 DTYPES = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-PROPERTY = settings(derandomize=True, deadline=None, max_examples=25, database=None)
 
 
 def vector(*values: float, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -595,7 +594,6 @@ def test_one_sample_estimate_is_score_minus_entropy_term(tau, tau_prime):
     assert_close(actual, (x.score - tau_prime * x.reference).squeeze(-1))
 
 
-@PROPERTY
 @given(x=groups(k=5), tau=st.floats(0, 3), tau_prime=st.floats(0.05, 3), seed=st.integers(0, 2**16))
 def test_soft_value_is_the_maximum_and_the_lifted_policy_attains_it(x, tau, tau_prime, seed):
     reference = x.reference.log_softmax(-1)
@@ -614,7 +612,6 @@ def test_soft_value_is_the_maximum_and_the_lifted_policy_attains_it(x, tau, tau_
 # ------------------------------------------------------------------------------------- properties
 
 
-@PROPERTY
 @given(x=groups(), tau=st.floats(0.01, 5), tau_prime=st.floats(0, 5))
 @every_surrogate
 def test_weights_are_a_distribution_and_ess_counts_them(name, x, tau, tau_prime):
@@ -624,7 +621,6 @@ def test_weights_are_a_distribution_and_ess_counts_them(name, x, tau, tau_prime)
     assert 1 - 1e-9 <= effective_sample_size(weights).item() <= weights.numel() + 1e-9
 
 
-@PROPERTY
 @given(x=groups(), data=st.data())
 @every_function
 def test_permuting_the_samples_permutes_the_result(name, x, data):
@@ -634,7 +630,6 @@ def test_permuting_the_samples_permutes_the_result(name, x, data):
     assert_close(permuted.per_sample, tuple(y[order] for y in straight.per_sample))
 
 
-@PROPERTY
 @given(x=groups(), constant=st.floats(-10, 10))
 @every_function
 def test_a_constant_added_to_the_score_moves_values_and_nothing_else(name, x, constant):
@@ -645,7 +640,6 @@ def test_a_constant_added_to_the_score_moves_values_and_nothing_else(name, x, co
     assert_close(shifted.per_sample, straight.per_sample, atol=1e-9, rtol=1e-9)
 
 
-@PROPERTY
 @given(x=groups(), data=st.data())
 @every_function
 def test_masked_samples_have_no_influence_whatever_stands_in_them(name, x, data):
@@ -741,7 +735,7 @@ EXTREME_LOG_PROBS = st.sampled_from([-1e30, -1e5, -1.0, 0.0]) | st.floats(-1e30,
 EXTREME_TEMPERATURES = st.floats(-8, 8).map(lambda exponent: 10.0**exponent)
 
 
-@settings(PROPERTY, max_examples=100)
+@settings(max_examples=100)
 @given(
     data=st.data(),
     dtype=st.sampled_from([torch.float32, torch.float64]),
@@ -818,7 +812,6 @@ def test_standardised_scores_of_nan_are_nan(dtype, standardised):
     assert standardised(score)[0].isnan().all()
 
 
-@PROPERTY
 @given(x=groups(k=5), scale=st.sampled_from([1e-30, 1e-3, 1.0, 1e30]), shift=st.floats(-9, 9))
 @pytest.mark.parametrize("standardised", [standardised, standardised_in_batch])
 def test_standardised_scores_have_mean_zero_and_deviation_one(standardised, x, scale, shift):
@@ -846,7 +839,6 @@ def test_scores_in_the_deviation_of_the_batch_by_hand(dtype, junk):
     assert_close(actual, expected.view(shape))
 
 
-@PROPERTY
 @given(x=groups(k=12), scale=st.sampled_from([1e-30, 1e-3, 1.0, 1e30]), data=st.data())
 def test_scores_in_the_deviation_of_the_batch(x, scale, data):
     """Neither a unit nor a shift of each group matters; the order of groups and samples is kept."""
@@ -897,7 +889,6 @@ def test_matched_temperature_at_its_edges(score, log_prob, expected):
     assert_close(matched_temperature(1.0, *tensors).item(), expected)
 
 
-@PROPERTY
 @given(x=groups(k=8), tau_prime=st.floats(0, 9), scale=st.floats(1, 1e3))
 def test_the_matched_term_knows_no_unit_of_surprise(x, tau_prime, scale):
     """Of at least a nat; and it spreads tau' times as far as the scores and 1/G."""
@@ -1176,7 +1167,7 @@ def test_one_sample_says_nothing_of_the_scale(dtype, log_weights):
     assert grad.loss.isfinite()
 
 
-@settings(PROPERTY, max_examples=100)
+@settings(max_examples=100)
 @given(data=st.data(), dtype=st.sampled_from([torch.float32, torch.float64]))
 def test_centred_projection_of_finite_input_is_never_nan(data, dtype):
     m = data.draw(st.integers(1, 4))

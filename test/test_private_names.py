@@ -21,17 +21,9 @@ SOURCES = [
 FOR_PRIVATE_NAMES = {"torchrl_ecpo/_torch.py", "torchrl_ecpo/_torchrl.py"}
 EXTENSION_POINTS = {
     # Documented as what a subclass has to define or may override.
-    "_AcceptedKeys",
-    "_call",
     "_forward_value_estimator_keys",
-    "_reset",
-    "_schedulable_buffers",
-    "_set_seed",
-    "_step",
     "_exit",  # os._exit
     # Of NamedTuple, whose public methods begin with an underscore.
-    "_asdict",
-    "_fields",
     "_replace",
 }
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-from functools import partial
 
 import pytest
 import torch
@@ -32,12 +31,6 @@ ANNEALED = (
     "loss.tau_prime={schedule:linear,start:0.3,end:0,duration:4000}",
 )
 SEEDS = (3, 11)
-
-
-@pytest.fixture
-def script(beside):
-    """Imports what is beside the script."""
-    return partial(beside, "ecpo")
 
 
 @pytest.fixture

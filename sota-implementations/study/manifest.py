@@ -458,7 +458,7 @@ def add_ignored(parser: argparse.ArgumentParser) -> None:
         "--ignore",
         type=_names,
         default=[],
-        help="entries of a configuration that make no difference: collector,loss.options.new",
+        help="entries of a configuration that make no difference: collector,loss.new",
     )
 
 

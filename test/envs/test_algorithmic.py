@@ -22,14 +22,7 @@ from torchrl_ecpo.envs._groups import GroupIdAllocator
 from torchrl_ecpo.envs.algorithmic import TASKS, AlgorithmicEnv
 
 DATA = Path(__file__).parents[1] / "data"
-GYM_NAMES = {
-    "copy": "Copy",
-    "duplicated_input": "DuplicatedInput",
-    "repeat_copy": "RepeatCopy",
-    "reverse": "Reverse",
-    "reversed_addition": "ReversedAddition",
-    "reversed_addition3": "ReversedAddition3",
-}
+GYM_NAMES = {name: name.title().replace("_", "") for name in TASKS}
 TASK_NAMES = list(GYM_NAMES)
 
 

@@ -18,7 +18,7 @@ from tensordict.nn import (
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
-from trajectory_problems import ACTORS, OBSERVATION
+from trajectory_problems import ACTORS, OBSERVATION, as_keywords
 
 from torchrl_ecpo import (
     ActorCriticLoss,
@@ -217,11 +217,6 @@ def make_batch(
         },
         batch_size=shape,
     )
-
-
-def as_keywords(loss: ActorCriticLoss, batch: TensorDictBase) -> dict[str, Tensor]:
-    """The keywords of a call without a tensordict: the in_keys, joined by _."""
-    return {"_".join((key,) if isinstance(key, str) else key): batch[key] for key in loss.in_keys}
 
 
 def call_by_keywords(loss: ActorCriticLoss, batch: TensorDictBase, seed: int = 0) -> Any:

@@ -15,7 +15,7 @@ from actor_critic_problems import become, call, make_batch, make_networks
 from actor_critic_problems import gradients as gradients_by_name
 from torch.testing import assert_close
 from torchrl.objectives import HardUpdate
-from trajectory_problems import MASK, gradients, make_actor, move, pad, sample, split
+from trajectory_problems import MASK, as_keywords, gradients, make_actor, move, pad, sample, split
 
 from torchrl_ecpo import ECACLoss, PolyakAverage, TemperatureScheduler, TrajectoryGroupLoss
 from torchrl_ecpo import GRPOLoss as PublicGRPOLoss
@@ -174,7 +174,7 @@ def test_what_a_member_adds_is_treated_like_the_rest(loss_class):
         assert_close(outs["mean"][key], each.mean())
         assert_close(outs["sum"][key], each.sum() if key.startswith("loss_") else each.mean())
     loss, last = losses["mean"], OUT_KEYS[loss_class][1]
-    keywords = {"_".join(k) if isinstance(k, tuple) else k: batch[k] for k in loss.in_keys}
+    keywords = as_keywords(loss, batch)
     values = loss(**keywords)
     assert_close(list(values), list(outs["mean"].values()))
     loss.select_out_keys(last)

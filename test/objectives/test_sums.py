@@ -19,8 +19,6 @@ from trajectory_problems import CASES, DELAYED, MASK
 import torchrl_ecpo
 from torchrl_ecpo import ECPOLoss, GRPOLoss, LiftProjectLoss, REPSLoss, TPOLoss, TrajectoryGroupLoss
 
-PROPERTY = settings(derandomize=True, deadline=None, max_examples=5, database=None)
-
 
 class Recorded(TensorDictModuleBase):
     """A policy whose log-probabilities are an entry of the batch, times a parameter."""
@@ -87,7 +85,7 @@ def evaluate(loss_class, options, batch):
     return loss, out.detach(), slopes
 
 
-@PROPERTY
+@settings(max_examples=5)
 @given(seed=st.integers(0, 10**6))
 @pytest.mark.parametrize("name", MEMBERS)
 def test_a_loss_that_reads_no_steps_is_that_of_the_sums(name, seed):

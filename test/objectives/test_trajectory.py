@@ -717,12 +717,6 @@ def test_one_group_of_one_step_problems():
     assert_close(loss(batch), loss(batch.unsqueeze(-1)))
 
 
-def test_no_value_estimator():
-    """Returns are sums, and say so where somebody asks for another gamma."""
-    with pytest.raises(NotImplementedError, match=r"undiscounted sum of \('next', 'reward'\)"):
-        ECPO.build(make_actor()).make_value_estimator(gamma=0.9)
-
-
 def test_actor_with_a_log_prob_of_trailing_dimension():
     """A distribution that is not summed over the action's components."""
     network = torch.nn.Sequential(torch.nn.Linear(3, 2), NormalParamExtractor())

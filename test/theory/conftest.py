@@ -1,6 +1,10 @@
-"""Lets the tests of this folder import ``problems``."""
+from __future__ import annotations
 
-import sys
-from pathlib import Path
+import pytest
+from problems import PROBLEMS, Problem
 
-sys.path.insert(0, str(Path(__file__).parent))
+
+@pytest.fixture(scope="module", params=PROBLEMS, ids=lambda problem: problem.name)
+def problem(request: pytest.FixtureRequest) -> Problem:
+    """Each of the small problems."""
+    return request.param

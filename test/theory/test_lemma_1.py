@@ -12,7 +12,7 @@ import itertools
 
 import pytest
 import torch
-from problems import MDP, PROBLEMS, Problem, gradient, kl, make_problem, target
+from problems import MDP, Problem, gradient, kl, make_problem, target
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -41,7 +41,6 @@ ESTIMATORS = {
     "mode_seeking": mode_seeking_projection,
 }
 every_estimator = pytest.mark.parametrize("estimator", ESTIMATORS)
-every_problem = pytest.mark.parametrize("problem", PROBLEMS, ids=lambda p: p.name)
 
 
 def exact_gradient(problem: Problem, theta: Tensor, reference: Tensor, estimator: str) -> Tensor:
@@ -80,7 +79,6 @@ def slope(sizes: list[int], errors: list[Tensor]) -> float:
     return (((x - x.mean()) * (y - y.mean())).sum() / (x - x.mean()).square().sum()).item()
 
 
-@every_problem
 @every_estimator
 def test_the_error_falls_with_the_root_of_the_sample_size(problem: Problem, estimator):
     theta, other = problem.parameters(5, 2, scale=0.5)

@@ -12,18 +12,14 @@ the bound looser than need be, but true. (Some prints of the paper read 1/(2n) f
 
 from __future__ import annotations
 
-import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from problems import PROBLEMS, Problem, entropy, expectation, seeds, temperatures
+from problems import Problem, entropy, expectation, seeds, temperatures
 from torch import Tensor
 from torch.testing import assert_close
 
 from torchrl_ecpo.functional import surrogate_reward
-
-every_problem = pytest.mark.parametrize("problem", PROBLEMS, ids=lambda p: p.name)
-PROPERTY = settings(derandomize=True, deadline=None, max_examples=20, database=None)
 
 
 def upper_bound(reward_hat: Tensor, policy: Tensor, ceiling: Tensor, scale: float) -> Tensor:
@@ -31,14 +27,12 @@ def upper_bound(reward_hat: Tensor, policy: Tensor, ceiling: Tensor, scale: floa
     return expectation(policy, reward_hat) + spread / (2 * scale)
 
 
-@PROPERTY
 @given(
     temperature=st.tuples(st.just(0.0) | temperatures, temperatures)
     | st.tuples(temperatures, st.just(0.0)),
     shift=st.floats(-5, 5),
     seed=seeds,
 )
-@every_problem
 def test_bounds(problem: Problem, temperature, shift, seed):
     tau, tau_prime = temperature
     reward = problem.reward + shift  # all signs
@@ -63,9 +57,7 @@ def test_the_constant_is_a_temperature_and_not_a_count():
     assert sr <= upper_bound(reward, policy, ceiling, scale=0.1)
 
 
-@PROPERTY
 @given(seed=seeds)
-@every_problem
 def test_limit_without_regularisation_is_the_best_reward(problem: Problem, seed):
     """At least max (r + tau log pi), and at most (tau + tau') log n more."""
     policy = problem.log_prob(problem.parameters(seed))
@@ -76,9 +68,7 @@ def test_limit_without_regularisation_is_the_best_reward(problem: Problem, seed)
         assert -tau * -policy[best] - 1e-12 <= sr - problem.reward[best] <= above + 1e-12
 
 
-@PROPERTY
 @given(tau_prime=st.just(0.0) | temperatures, seed=seeds)
-@every_problem
 def test_limit_of_infinite_divergence_is_the_regularised_reward(problem: Problem, tau_prime, seed):
     """With the rate: the gap is the variance of r_hat over 2 tau, to first order."""
     policy = problem.log_prob(problem.parameters(seed))

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from problems import (
-    PROBLEMS,
     Problem,
     gradient,
     kl,
@@ -27,13 +26,8 @@ from torch.testing import assert_close
 
 from torchrl_ecpo.functional import soft_value
 
-every_problem = pytest.mark.parametrize("problem", PROBLEMS, ids=lambda p: p.name)
-PROPERTY = settings(derandomize=True, deadline=None, max_examples=20, database=None)
 
-
-@PROPERTY
 @given(tau=temperatures, tau_prime=st.just(0.0) | temperatures, seed=seeds)
-@every_problem
 def test_the_objectives_are_affine_in_each_other(problem: Problem, tau, tau_prime, seed):
     at = {"tau": tau, "tau_prime": tau_prime}
     policies = problem.log_prob(problem.parameters(seed, 10))
@@ -45,9 +39,7 @@ def test_the_objectives_are_affine_in_each_other(problem: Problem, tau, tau_prim
     assert_close((tau + tau_prime) * divergence, shortfall, atol=1e-9, rtol=1e-9)
 
 
-@PROPERTY
 @given(tau=temperatures, tau_prime=st.just(0.0) | temperatures, seed=seeds)
-@every_problem
 def test_the_gradients_are_proportional(problem: Problem, tau, tau_prime, seed):
     at = {"tau": tau, "tau_prime": tau_prime}
     theta, other = problem.parameters(seed, 2)
@@ -62,7 +54,6 @@ def test_the_gradients_are_proportional(problem: Problem, tau, tau_prime, seed):
 
 
 @pytest.mark.parametrize(("tau", "tau_prime"), [(0.5, 0.0), (0.1, 0.3)])
-@every_problem
 def test_the_best_of_a_finite_class_is_the_same(problem: Problem, tau, tau_prime):
     """However non-convex the class: here a thousand policies without any structure."""
     at = {"tau": tau, "tau_prime": tau_prime}
@@ -73,7 +64,6 @@ def test_the_best_of_a_finite_class_is_the_same(problem: Problem, tau, tau_prime
 
 
 @pytest.mark.parametrize(("tau", "tau_prime"), [(0.5, 0.0), (0.1, 0.3)])
-@every_problem
 def test_descent_on_either_ends_at_the_same_policy(problem: Problem, tau, tau_prime):
     at = {"tau": tau, "tau_prime": tau_prime}
     start, other = problem.parameters(7, 2, scale=0.3)

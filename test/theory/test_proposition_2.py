@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from problems import (
-    PROBLEMS,
     Problem,
     entropy,
     expectation,
@@ -26,17 +25,12 @@ from problems import (
 from torch import Tensor
 from torch.testing import assert_close
 
-every_problem = pytest.mark.parametrize("problem", PROBLEMS, ids=lambda p: p.name)
-PROPERTY = settings(derandomize=True, deadline=None, max_examples=20, database=None)
-
 
 def regularised_reward(problem: Problem, policy: Tensor, tau_prime: float) -> Tensor:
     return expectation(policy, problem.reward) + tau_prime * entropy(policy)
 
 
-@PROPERTY
 @given(tau=temperatures, tau_prime=st.just(0.0) | temperatures, seed=seeds)
-@every_problem
 def test_reward_never_falls_when_the_projection_is_solved(problem: Problem, tau, tau_prime, seed):
     policies = problem.log_prob(problem.parameters(seed, 50))
     reference = policies[0]
@@ -50,9 +44,7 @@ def test_reward_never_falls_when_the_projection_is_solved(problem: Problem, tau,
         reference = policy
 
 
-@PROPERTY
 @given(tau=temperatures, tau_prime=st.just(0.0) | temperatures, seed=seeds)
-@every_problem
 def test_the_first_project_step_follows_the_reward_gradient(problem: Problem, tau, tau_prime, seed):
     """So a point where the projection does not move is stationary, and the other way round."""
     theta = problem.parameters(seed)
@@ -68,7 +60,6 @@ def test_the_first_project_step_follows_the_reward_gradient(problem: Problem, ta
 
 
 @pytest.mark.parametrize("tau", [0.3, 3.0])
-@every_problem
 def test_a_stationary_point_is_a_fixed_point(problem: Problem, tau):
     """The reward is drawn from those of which theta is a stationary point."""
     theta = problem.parameters(3)

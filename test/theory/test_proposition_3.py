@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from problems import PROBLEMS, Problem, kl, seeds
 from torch import Tensor
 
 from torchrl_ecpo.functional import mean_seeking_projection
 
-PROPERTY = settings(derandomize=True, deadline=None, max_examples=20, database=None)
 ONE_LAYER = [p for p in PROBLEMS if not p.name.startswith("hidden")]
 one_layer = pytest.mark.parametrize("problem", ONE_LAYER, ids=lambda p: p.name)
 hidden = pytest.mark.parametrize(
@@ -40,7 +39,6 @@ def lowest_curvature(function, problem: Problem, seed: int) -> float:
     return torch.linalg.eigvalsh(hessian).min().item()
 
 
-@PROPERTY
 @given(seed=seeds)
 @one_layer
 def test_the_hessian_is_positive_semidefinite(problem: Problem, seed):
@@ -48,7 +46,6 @@ def test_the_hessian_is_positive_semidefinite(problem: Problem, seed):
     assert lowest_curvature(lambda x: loss(problem, x, lifted), problem, seed + 1) >= -1e-9
 
 
-@PROPERTY
 @given(seed=seeds)
 @one_layer
 def test_a_chord_lies_above(problem: Problem, seed):
@@ -60,7 +57,6 @@ def test_a_chord_lies_above(problem: Problem, seed):
     assert (values <= chord + 1e-9).all()
 
 
-@PROPERTY
 @given(seed=seeds)
 @one_layer
 def test_the_loss_is_the_divergence_up_to_a_constant(problem: Problem, seed):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from problems import (
     PROBLEMS,
@@ -26,16 +26,12 @@ from torch.testing import assert_close
 
 from torchrl_ecpo.functional import surrogate_reward
 
-every_problem = pytest.mark.parametrize("problem", PROBLEMS, ids=lambda p: p.name)
 one_layer = pytest.mark.parametrize(
     "problem", [p for p in PROBLEMS if not p.name.startswith("hidden")], ids=lambda p: p.name
 )
-PROPERTY = settings(derandomize=True, deadline=None, max_examples=20, database=None)
 
 
-@PROPERTY
 @given(tau=st.just(0.0) | temperatures, tau_prime=temperatures, seed=seeds)
-@every_problem
 def test_sr_never_falls_when_the_projection_is_solved(problem: Problem, tau, tau_prime, seed):
     at = {"tau": tau, "tau_prime": tau_prime}
     policies = problem.log_prob(problem.parameters(seed, 50))
@@ -83,9 +79,7 @@ def test_expected_reward_may_fall_meanwhile():
     )
 
 
-@PROPERTY
 @given(tau=temperatures, tau_prime=st.just(0.0) | temperatures, seed=seeds)
-@every_problem
 def test_the_first_project_step_follows_the_gradient_of_sr(problem: Problem, tau, tau_prime, seed):
     """grad KL(lifted, pi_theta) = -grad SR / tau at the reference, where SR is not constant."""
     at = {"tau": tau, "tau_prime": tau_prime}
@@ -99,7 +93,6 @@ def test_the_first_project_step_follows_the_gradient_of_sr(problem: Problem, tau
 
 
 @pytest.mark.parametrize(("tau", "tau_prime"), [(0.3, 0.0), (0.3, 0.1), (3.0, 1.0)])
-@every_problem
 def test_a_stationary_point_of_sr_is_a_fixed_point(problem: Problem, tau, tau_prime):
     """The reward is chosen such that theta is stationary: its target has no mean score function."""
     at = {"tau": tau, "tau_prime": tau_prime}
@@ -121,9 +114,7 @@ def test_a_stationary_point_of_sr_is_a_fixed_point(problem: Problem, tau, tau_pr
     assert_close(moved, theta, atol=1e-9, rtol=0)
 
 
-@PROPERTY
 @given(tau_prime=temperatures, seed=seeds)
-@every_problem
 def test_without_divergence_sr_is_the_same_for_every_policy(problem: Problem, tau_prime, seed):
     """At tau = 0 the theorem is true and empty: the lift has forgotten its reference."""
     values = [
