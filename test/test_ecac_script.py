@@ -311,6 +311,8 @@ def test_a_game_of_minatar_and_fewer_updates_than_frames(tmp_path, train):
             ["env=cartpole", "loss=discrete_sac", "loss.value_network=true"],
             "loss.value_network=true does not go with loss=discrete_sac",
         ),
+        (["loss=td3", "loss.value_network=true"], "value_network=true does not go with loss=td3"),
+        (["loss=sac_score", "loss.value_network=false"], "loss=sac_score needs a value network"),
         (["~optim.lr.log_tau"], "optim.lr must have a learning rate for each of"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",

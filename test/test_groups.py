@@ -118,7 +118,7 @@ class TestPack:
         ),
         st.randoms(use_true_random=False),
     )
-    @settings(max_examples=40, derandomize=False)
+    @settings(max_examples=40)
     def test_any_lengths_and_order(self, groups, random):
         trajectories = [(group, length) for group, lengths in groups for length in lengths]
         random.shuffle(trajectories)

@@ -22,6 +22,7 @@ from torchrl.objectives import (
 
 from torchrl_ecpo import ECACLoss
 from torchrl_ecpo._torchrl import networks_with_updater
+from torchrl_ecpo.checks import values_can_be_seen
 from torchrl_ecpo.modules import make_qvalue_network, make_tanh_gaussian_actor
 from torchrl_ecpo.updaters import PeriodicCopy, PolyakAverage, UpdaterSequence
 
@@ -136,6 +137,14 @@ class TestPeriodicCopy:
                 assert equal(after, before)
             before = after
         assert copies == list(range(interval, 11, interval))
+
+    def test_a_graph_of_cuda_would_not_count(self, monkeypatch):
+        monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+        monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: True)
+        assert not values_can_be_seen()
+        PeriodicCopy(sac(), "actor_network", interval=1).step()
+        with pytest.raises(RuntimeError, match=r"call step\(\) outside of the graph"):
+            PeriodicCopy(sac(), "actor_network", interval=2).step()
 
     def test_init_and_a_saved_state_set_the_count(self):
         loss = ddpg()

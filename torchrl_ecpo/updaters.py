@@ -211,7 +211,7 @@ class PeriodicCopy(_NetworkUpdater):
         self.counter = 0
 
     def _is_due(self) -> bool:
-        if is_captured():
+        if self.interval > 1 and is_captured():
             raise RuntimeError(
                 "PeriodicCopy counts its calls, which a CUDA graph would not replay: call step() "
                 "outside of the graph."

@@ -128,8 +128,10 @@ def _problems(loss: DictConfig, critic: str, has_pixels: bool) -> Iterator[str]:
         )
     if loss.actor == "categorical" and loss.exploration is not None:
         yield "loss.exploration is noise on numbers, not on one discrete action: leave it out"
-    if loss.name == "discrete_sac" and loss.value_network:
-        yield "loss.value_network=true does not go with loss=discrete_sac: leave it out"
+    if loss.value_network and loss.name in ("discrete_sac", "tqc", "crossq", "td3", "ddpg"):
+        yield f"loss.value_network=true does not go with loss={loss.name}: leave it out"
+    if loss.name == "sac_score" and not loss.value_network:
+        yield "loss=sac_score needs a value network: leave out loss.value_network=false"
 
 
 # ------------------------------------------------------------------------------------ environments

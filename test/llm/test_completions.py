@@ -212,6 +212,13 @@ def test_rewards_of_tokens_are_added_up(model):
     assert returns.tolist() == [[len(RESPONSES[i]) / 2 for i in members] for members in GROUPS]
 
 
+@pytest.mark.parametrize("shape", [(6,), (6, 1), (6, 1, 1)])
+def test_rewards_of_completions(model, shape):
+    actor, batch = make(model, pad_output=True)
+    batch["next", "reward"] = torch.tensor(REWARDS).view(shape)
+    assert_close(RLOOLoss(actor)._read(batch).returns, torch.tensor(REWARDS)[torch.tensor(GROUPS)])
+
+
 def test_rewards_of_padding_count_for_nothing(model):
     """Of all tokens or of the response's; whatever stands there, NaN too."""
     actor, batch = make(model, pad_output=True)
@@ -402,6 +409,9 @@ def test_the_model_pads_with_the_tokenizers_padding(of_model):
     message = "pad_token_id=(None|1) .*the tokenizer with 0.*generation_config.pad_token_id = 0"
     with pytest.raises(ValueError, match=message):
         check_sampler(sampler)
+    sampler = tiny.make_sampler(model, tokenizer=tiny.make_tokenizer(pad_token="<end>"))
+    with pytest.raises(ValueError, match="no padding token of its own"):
+        check_sampler(sampler)
 
 
 def test_a_model_that_the_wrapper_calls_wrongly():
@@ -413,24 +423,6 @@ def test_a_model_that_the_wrapper_calls_wrongly():
     sampler = tiny.make_sampler(model)
     with pytest.raises(ValueError, match=message):
         check_sampler(sampler)
-    sampler.model = InPEFT(model)
-    with pytest.raises(ValueError, match=message):
-        check_sampler(sampler)
-
-
-class InPEFT(nn.Module):
-    """The interface of PEFT's wrapper of a model, whose own second argument is the mask."""
-
-    def __init__(self, model):
-        super().__init__()
-        self.model, self.config = model, model.config
-        self.generation_config = model.generation_config
-
-    def get_base_model(self):
-        return self.model
-
-    def forward(self, input_ids, attention_mask):
-        return self.model(input_ids, attention_mask=attention_mask)
 
 
 def test_a_compiled_model_is_looked_into():
@@ -529,7 +521,7 @@ def test_other_tokens(model, monkeypatch):
     loss_module = ECPOLoss(actor)
     loss_module.set_keys(action=("tokens", "other"))
     batch["tokens", "other"] = batch[FULL][:, 1:]
-    with pytest.raises(ValueError, match=r"7 tokens, but .* others than were sampled"):
+    with pytest.raises(ValueError, match=r"8 tokens, but .* others than were sampled"):
         loss_module(batch)
     divided = actor.get_dist(batch, mask_key=("masks", "all_attention_mask"), padding_side="left")
     monkeypatch.setattr(actor, "get_dist", lambda *_, **__: divided)

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from tensordict import LazyStackedTensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn.functional import cross_entropy
@@ -73,14 +73,7 @@ def check_actor(actor: Any) -> None:
             "input_key, or name the 'full' entry (get_new_version(generate=False) keeps the "
             "sampler's key)."
         )
-    tokenizer = getattr(actor, "tokenizer", None)
-    padding = getattr(tokenizer, "pad_token_id", None)
-    if padding is None or padding == getattr(tokenizer, "eos_token_id", None):
-        raise ValueError(
-            "The actor's tokenizer has no padding token of its own (the wrapper then takes the "
-            "end-of-sequence token, and the end of a completion would count for nothing). Set "
-            "tokenizer.pad_token to a token that is never sampled."
-        )
+    _own_padding(actor)
     mode = getattr(actor, "input_mode", "tokens")
     if mode != "tokens":
         raise ValueError(
@@ -142,7 +135,6 @@ def check_sampler(sampler: Any) -> None:
 def _check_arguments(model: Any) -> None:
     """Refuse a model whose attention mask TorchRL's wrapper would pass for something else."""
     model = getattr(model, "_orig_mod", model)  # which torch.compile wraps
-    model = model.get_base_model() if hasattr(model, "get_base_model") else model  # of PEFT
     second = [*inspect.signature(model.forward).parameters.values()][1:2]
     named = [one.name for one in second if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)]
     if named not in ([], ["attention_mask"]):
@@ -153,11 +145,22 @@ def _check_arguments(model: Any) -> None:
         )
 
 
+def _own_padding(wrapper: Any) -> int:
+    """The padding token, which must be none that ends a completion."""
+    tokenizer = getattr(wrapper, "tokenizer", None)
+    padding = getattr(tokenizer, "pad_token_id", None)
+    if padding is None or padding == getattr(tokenizer, "eos_token_id", None):
+        raise ValueError(
+            "The tokenizer has no padding token of its own (the wrapper then takes the "
+            "end-of-sequence token, and the end of a completion would count for nothing). Set "
+            "tokenizer.pad_token to a token that is never sampled."
+        )
+    return padding
+
+
 def _check_padding(sampler: Any, config: Any) -> None:
     """Refuse padding that would count as a token, and tokens that would count as padding."""
-    padding = getattr(getattr(sampler, "tokenizer", None), "pad_token_id", None)
-    if padding is None:
-        return
+    padding = _own_padding(sampler)
     options = sampler.generate_kwargs or {}
     given = {
         name: options.get(name, getattr(config, name, None))
@@ -166,15 +169,16 @@ def _check_padding(sampler: Any, config: Any) -> None:
     if given["pad_token_id"] != padding:
         raise ValueError(
             f"The model pads with pad_token_id={given['pad_token_id']} (None: the end of a "
-            f"completion), the tokenizer with {padding}: padding would count as sampled. Set "
-            f"model.generation_config.pad_token_id = {padding}."
+            f"completion), the tokenizer with {padding}: padding would count as sampled. Leave it "
+            f"out of generate_kwargs, and set model.generation_config.pad_token_id = {padding}."
         )
     ends = given["eos_token_id"]
     ends = ends if isinstance(ends, (list, tuple)) else [ends]
     if padding in ends and padding not in (given["suppress_tokens"] or ()):
         raise ValueError(
             f"The padding token, {padding}, is among eos_token_id={ends}: an end of a completion "
-            f"would count for nothing. Set model.generation_config.suppress_tokens = [{padding}]."
+            "would count for nothing. Leave it out of generate_kwargs, or set "
+            f"model.generation_config.suppress_tokens = [{padding}]."
         )
 
 
@@ -265,8 +269,8 @@ def read_completions(
         tensordict: completions ``[B]``, groups of which `prompt_key` tells, or groups ``[*G, K]``.
         tokens_key: prompt and completion.
         log_prob_key: their recorded log-probabilities.
-        reward_key: of a completion, or of its tokens (all, or those of the response), which are
-            added up; those of padding count for nothing.
+        reward_key: of a completion, ``[B]`` or ``[B, 1]``, or of its tokens (all, or those of the
+            response), which are added up; those of padding count for nothing.
         prompt_key: text, integer or tokens, equal within a group only.
         mask_key: which tokens are the policy's own. ``"auto"``: those after the prompt; None: all.
 
@@ -358,7 +362,8 @@ def _entries(rows: Any, key: NestedKey) -> Any:
 def _returns(rows: Any, key: NestedKey, prompt_key: NestedKey, attention: Tensor) -> Tensor:
     """The returns ``[B]``, in single precision at least: equal ones must not come of rounding."""
     rewards = _padded(rows, key, 0.0)
-    rewards = widened(rewards).flatten(1)
+    of_steps = rewards.shape[1:2] or (1,)
+    rewards = widened(rewards).reshape(len(rewards), *of_steps, -1).sum(-1)
     width, length = rewards.shape[-1], attention.shape[-1]
     prompts = _entries(rows, prompt_key)
     of_response = length - max(len(prompt) for prompt in prompts) if prompts is not None else length
@@ -370,25 +375,19 @@ def _returns(rows: Any, key: NestedKey, prompt_key: NestedKey, attention: Tensor
 
 def _evaluate(actor: Any, rows: TensorDictBase, key: NestedKey) -> tuple[Tensor, Tensor, Tensor]:
     """Logits ``[B, L, V]`` of each token given those before it, which are real, and the tokens."""
-    tokens = _padded(rows, key, 0)
-    is_padding = tokens == actor.tokenizer.pad_token_id
-    elsewhere = (
-        f"Rows of {key!r} are padded, which the actor strips (pad_output=False), so that its "
-        "log-probabilities would be of other tokens. Build it with pad_output=True."
-    )
-    strips = not getattr(actor, "pad_output", True)
-    stacked = isinstance(rows, LazyStackedTensorDict)  # what the wrapper then returns
-    if strips and not stacked and values_can_be_seen() and is_padding.any():
-        raise ValueError(elsewhere)
+    tokens = _padded(rows, key, -1)
+    strips = not getattr(actor, "pad_output", True) and values_can_be_seen()
+    if strips and (tokens == actor.tokenizer.pad_token_id).any():
+        raise ValueError(
+            f"Rows of {key!r} are padded, which the actor strips (pad_output=False), so that its "
+            "log-probabilities would be of other tokens. Build it with pad_output=True."
+        )
     logits, attention = _logits(actor, rows)
     if tokens.shape != attention.shape:
         raise ValueError(
             f"The actor evaluates {attention.shape[-1]} tokens, but {key!r} has "
-            f"{tokens.shape[-1]}: others than were sampled, or rows are padded, which it strips; "
-            "then build it with pad_output=True."
+            f"{tokens.shape[-1]}: others than were sampled."
         )
-    if values_can_be_seen() and (attention & is_padding).any():
-        raise ValueError(elsewhere)
     return logits, attention, tokens
 
 

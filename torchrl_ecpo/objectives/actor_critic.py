@@ -6,7 +6,6 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
@@ -369,7 +368,9 @@ class ActorCriticLoss(PolicyLoss):
         states = self.states(transitions, mask)
         if not self._reads_action:  # the network has valued all actions: it is not asked twice
             first = qvalues.detach()[:, : self.num_actor_states]
-            states.make_lift = partial(self.lift, qvalue_params=first)
+            states.make_lift = lambda observations, reference: self.lift(
+                observations, reference, first
+            )
         surrogate = self.project(states)
         own = {name: x for name, x in surrogate.metrics.items() if name != "kl_target_reference"}
         self._check_declared(surrogate.losses, own)
@@ -527,7 +528,8 @@ class ActorCriticLoss(PolicyLoss):
             valued = tensordict.copy()
             valued.set(unravel_key(("next", self.tensor_keys.value)), value)
             if mask is not None and mask.ndim:
-                if getattr(self.value_estimator, "average_rewards", False):
+                averages = getattr(self.value_estimator, "average_rewards", False)
+                if averages and not (values_can_be_seen() and mask.all()):
                     raise ValueError(
                         "A value estimator with average_rewards=True counts the rewards that a "
                         "mask leaves out too. Leave out average_rewards, or the masked transitions."

@@ -183,7 +183,7 @@ class ECACLoss(ActorCriticLoss):
         self,
         observations: TensorDictBase,
         reference: Distribution,
-        qvalue_params: TensorDictParams | None = None,
+        qvalue_params: TensorDictParams | Tensor | None = None,
         num_samples: int | None = None,
     ) -> Lift:
         """The base's; with ``projection="gradient"``, where the policy learns, by pairs and slopes.
