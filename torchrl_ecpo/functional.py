@@ -87,7 +87,6 @@ __all__ = [
     "uniform_weights",
     "urex_surrogate",
     "weighted_sum",
-    "widened",
 ]
 
 
