@@ -110,28 +110,28 @@ def check_config(config: DictConfig, options: Sequence[str] = ()) -> None:
         make_actor(config, env)
         has_pixels = not isinstance(_observation_size(env), int)
     if problems := [*_problems(config.loss, config.critic, has_pixels)]:
-        raise ValueError("\n".join(f"{problem}." for problem in problems))
+        raise ValueError("\n".join(problems))
 
 
 def _problems(loss: DictConfig, critic: str, has_pixels: bool) -> Iterator[str]:
     if loss.name == "crossq" and critic != "plain":
         yield (
             f"critic={critic} does not go with loss=crossq, whose critics normalise by batches: "
-            "leave it out"
+            "leave it out."
         )
     if loss.name in ("crossq", "sac_score") and has_pixels:
-        yield f"loss={loss.name} does not read pixels: take loss=sac or another"
+        yield f"loss={loss.name} does not read pixels: take loss=sac or another."
     if "alpha_init" in loss and loss.target_entropy is None:
         yield (
             f"loss.target_entropy=null does not go with loss={loss.name}, which learns its "
-            "temperature: give a number, in nats, or auto"
+            "temperature: give a number, in nats, or auto."
         )
     if loss.actor == "categorical" and loss.exploration is not None:
-        yield "loss.exploration is noise on numbers, not on one discrete action: leave it out"
+        yield "loss.exploration is noise on numbers, not on one discrete action: leave it out."
     if loss.value_network and loss.name in ("discrete_sac", "tqc", "crossq", "td3", "ddpg"):
-        yield f"loss.value_network=true does not go with loss={loss.name}: leave it out"
+        yield f"loss.value_network=true does not go with loss={loss.name}: leave it out."
     if loss.name == "sac_score" and not loss.value_network:
-        yield "loss=sac_score needs a value network: leave out loss.value_network=false"
+        yield "loss=sac_score needs a value network: leave out loss.value_network=false."
 
 
 # ------------------------------------------------------------------------------------ environments

@@ -434,7 +434,7 @@ class Reduction(NamedTuple):
         return values if values.shape != self.shape else self.mean(values)
 
     def mean(self, values: Tensor) -> Tensor:
-        """Over the real states, without weights."""
+        """Over the real states, without weights; in single precision at least, as all sums."""
         values = widened(values)
         if self.mask is None:
             return values.mean()
