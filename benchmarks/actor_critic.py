@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import torch
 from common import read_arguments, write_csv
-from hydra import compose, initialize_config_dir
 from loop import Iteration, take_turns
 from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
@@ -29,6 +28,8 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import LossModule, TargetNetUpdater
+
+from torchrl_ecpo.experiment import compose_options
 
 SCRIPT = Path(__file__).resolve().parents[1] / "sota-implementations/ecac"
 sys.path.append(str(SCRIPT))
@@ -64,9 +65,8 @@ FRAMES = 200
 
 def configure(overrides: list[str]) -> DictConfig:
     """The script's configuration."""
-    with initialize_config_dir(str(SCRIPT / "config"), version_base="1.3"):
-        frames = ["total_frames=1000000000", "collector.init_random_frames=0"]
-        return compose("config", ["env=halfcheetah", *frames, *overrides])
+    frames = ["total_frames=1000000000", "collector.init_random_frames=0"]
+    return compose_options(SCRIPT, ["env=halfcheetah", *frames, *overrides])
 
 
 class Parts(NamedTuple):

@@ -89,14 +89,21 @@ def bias_to_last(actor: nn.Module, stray: float = STRAY, write: float = WRITE) -
         readout.bias.copy_(bias.expand_as(readout.bias))
 
 
-def ecpo_loop(level: int, num_groups: int, actor: ProbabilisticActor) -> Iteration:
-    """The package's loop, as the script has it."""
+def make_ecpo(
+    level: int, num_groups: int, actor: ProbabilisticActor
+) -> tuple[TrajectoryGroupCollector, ECPOLoss, torch.optim.Optimizer]:
+    """The parts of the package's loop, as the script has them."""
     env = make_env(level, num_groups)
     collector = TrajectoryGroupCollector(
         env, actor, num_groups=num_groups, group_size=GROUP_SIZE, exclude_keys=["logits"]
     )
     loss_module = ECPOLoss(actor, tau=TAU, tau_prime=TAU_PRIME)
-    optimizer = torch.optim.Adam(loss_module.parameters(), lr=LEARNING_RATE)
+    return collector, loss_module, torch.optim.Adam(loss_module.parameters(), lr=LEARNING_RATE)
+
+
+def ecpo_loop(level: int, num_groups: int, actor: ProbabilisticActor) -> Iteration:
+    """The package's loop."""
+    collector, loss_module, optimizer = make_ecpo(level, num_groups, actor)
     batches = iter(collector)
     iteration = 0
 

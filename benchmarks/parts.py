@@ -16,24 +16,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-import torch
 from actor_critic import configure, make_data, make_parts
 from common import read_arguments, write_csv
 from ecac import total  # pyright: ignore[reportMissingImports]
-from loop import (
-    GROUP_SIZE,
-    LEARNING_RATE,
-    MAX_GRAD_NORM,
-    PROJECT_STEPS,
-    TAU,
-    TAU_PRIME,
-    make_actor,
-    make_env,
-)
+from loop import MAX_GRAD_NORM, PROJECT_STEPS, make_actor, make_ecpo
 from torch.nn.utils import clip_grad_norm_
-
-from torchrl_ecpo import ECPOLoss
-from torchrl_ecpo.collectors import TrajectoryGroupCollector
 
 LEVEL, NUM_GROUPS = 10, 40
 
@@ -59,16 +46,7 @@ Iteration = Callable[[Stopwatch], int]
 
 def ecpo() -> Iteration:
     """A lift and its projections."""
-    actor = make_actor()
-    collector = TrajectoryGroupCollector(
-        make_env(LEVEL, NUM_GROUPS),
-        actor,
-        num_groups=NUM_GROUPS,
-        group_size=GROUP_SIZE,
-        exclude_keys=["logits"],
-    )
-    loss_module = ECPOLoss(actor, tau=TAU, tau_prime=TAU_PRIME)
-    optimizer = torch.optim.Adam(loss_module.parameters(), lr=LEARNING_RATE)
+    collector, loss_module, optimizer = make_ecpo(LEVEL, NUM_GROUPS, make_actor())
     batches = iter(collector)
 
     def iterate(part: Stopwatch) -> int:

@@ -20,9 +20,10 @@ from pathlib import Path
 from typing import Any
 
 from common import read_arguments, write_csv
-from hydra import compose, initialize_config_dir
 from loop import PROJECT_STEPS, Iteration, bias_to_last, take_turns
 from torch.nn.utils import clip_grad_norm_
+
+from torchrl_ecpo.experiment import compose_options
 
 SCRIPT = Path(__file__).resolve().parents[1] / "sota-implementations/ecpo"
 sys.path.insert(0, str(SCRIPT))
@@ -43,8 +44,7 @@ def compose_run(env: str, level: int | None, seed: int) -> Any:
     options = [f"env={env}", f"seed={seed}", "form=paper"]
     if level:
         options += ["policy=lstm", "optim.lr=1e-9"]
-    with initialize_config_dir(str(SCRIPT / "config"), version_base="1.3"):
-        return compose("config", options)
+    return compose_options(SCRIPT, options)
 
 
 def single_run(env: str, level: int | None) -> Iteration:

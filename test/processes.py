@@ -8,6 +8,10 @@ import subprocess
 import sys
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
+from typing import Any
+
+import torch
+from torchrl.checkpoint import Checkpoint
 
 FORKED = multiprocessing.get_context("forkserver")
 FORKED.set_forkserver_preload(
@@ -66,3 +70,30 @@ def record(directory: Path) -> list[dict[str, str]]:
             {name: cell for name, cell in row.items() if name != "steps_per_second"}
             for row in csv.DictReader(file)
         ]
+
+
+def checkpoints(directory: Path) -> list[Path]:
+    """From the oldest on."""
+    return sorted((directory / "checkpoints").iterdir())
+
+
+def last_state(directory: Path, part: str) -> Any:
+    """A part of the last checkpoint."""
+    path = checkpoints(directory)[-1]
+    return torch.load(path / Checkpoint.manifest(path)["components"][part]["path"] / "state.pt")
+
+
+def assert_same_run(one: Path, other: Path) -> None:
+    """The same rows, and the same state at the end."""
+    assert record(one) == record(other)
+    for part in ("loss_module", "optimizer"):
+        states = [last_state(directory, part) for directory in (one, other)]
+        torch.testing.assert_close(*states, rtol=0, atol=0, equal_nan=True)
+    randoms = [last_state(directory, "random")["torch_cpu"] for directory in (one, other)]
+    assert torch.equal(*randoms)
+
+
+def contents(directory: Path) -> dict[str, bytes | None]:
+    """What is in all files, by name."""
+    files = directory.rglob("*")
+    return {str(file): file.read_bytes() if file.is_file() else None for file in files}

@@ -18,7 +18,15 @@ import pytest
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
-from processes import record, run_script, start_script
+from processes import (
+    assert_same_run,
+    checkpoints,
+    contents,
+    last_state,
+    record,
+    run_script,
+    start_script,
+)
 from tensordict import NonTensorData, TensorDict
 from torchrl.checkpoint import Checkpoint, CheckpointError
 from torchrl.envs import DMControlEnv, GymEnv, TransformedEnv
@@ -88,25 +96,6 @@ def start(run_here, monkeypatch):
 
 class Killed(Exception):
     """Ends a run with nothing but what is on the disk."""
-
-
-def checkpoints(directory):
-    return sorted((directory / "checkpoints").iterdir())
-
-
-def last_state(directory, part):
-    """A part of the last checkpoint."""
-    path = checkpoints(directory)[-1]
-    return torch.load(path / Checkpoint.manifest(path)["components"][part]["path"] / "state.pt")
-
-
-def assert_same_run(one, other):
-    assert record(one) == record(other)
-    for part in ("loss_module", "optimizer"):
-        states = [last_state(directory, part) for directory in (one, other)]
-        torch.testing.assert_close(*states, rtol=0, atol=0, equal_nan=True)
-    randoms = [last_state(directory, "random")["torch_cpu"] for directory in (one, other)]
-    assert torch.equal(*randoms)
 
 
 @pytest.mark.parametrize("name", RUNS)
@@ -228,12 +217,6 @@ def test_what_cannot_be_resumed_is_refused(interrupted, start, spoil, options, m
     with pytest.raises((CheckpointError, ValueError), match=message):
         start(interrupted, *RUNS["bandit"], f"resume={interrupted}", *options)
     assert contents(untouched) == before
-
-
-def contents(directory):
-    """What is in all files, by name."""
-    files = directory.rglob("*")
-    return {str(file): file.read_bytes() if file.is_file() else None for file in files}
 
 
 @pytest.mark.parametrize("value", [np.mean([1, 2]), np.zeros(2), [{"a": np.int64(1)}]], ids=str)

@@ -13,11 +13,10 @@ from textwrap import dedent
 
 import pytest
 import yaml
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 from processes import run_script
 
-from torchrl_ecpo.experiment.options import expand
+from torchrl_ecpo.experiment.options import compose_options, expand
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -104,8 +103,7 @@ def commands(page: Path) -> list[tuple[Path, str]]:
 
 @lru_cache
 def composed(config_directory: Path, overrides: tuple[str, ...]) -> DictConfig:
-    with initialize_config_dir(str(config_directory), version_base="1.3"):
-        return compose("config", list(overrides))
+    return compose_options(config_directory.parent, overrides)
 
 
 def compose_command(script: Path, options: str) -> None:

@@ -109,13 +109,6 @@ def test_a_summary_is_of_the_last_run_or_none(tmp_path):
     assert not (tmp_path / "summary.json").exists()
 
 
-def test_rows_are_on_disk_as_soon_as_they_are_logged(tmp_path):
-    run = make_run(tmp_path)
-    run.log({"return": 1.0}, step=10)
-    assert read_metrics(tmp_path)["return"] == [1]
-    run.__exit__(None, None, None)
-
-
 def test_an_interrupted_run_keeps_its_record_and_says_so(tmp_path):
     run = make_run(tmp_path)
     record(run)
@@ -271,7 +264,7 @@ def test_comparison_puts_the_runs_of_a_method_together(runs):
     assert "| urex | 1 | 30 | 1.000 | 2.000 | 2.000 |" in comparison.table()
 
 
-def test_comparison_ranks_methods_by_their_mean_over_the_run(runs):
+def test_comparison_ranks_methods_by_their_mean_over_the_run():
     steps, early, late = np.array([10.0, 20.0]), np.array([[4.0, 4.0]]), np.array([[0.0, 6.0]])
     rows = Comparison("return", {"late": (steps, late), "early": (steps, early)}).table()
     assert re.findall(r"\| (late|early) ", rows) == ["early", "late"]

@@ -18,11 +18,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from processes import record
-from torchrl.checkpoint import Checkpoint, CheckpointError
+from processes import assert_same_run, contents, record
+from torchrl.checkpoint import CheckpointError
 
-from torchrl_ecpo.experiment import Checkpoints
+from torchrl_ecpo.experiment import Checkpoints, compose_options
 
 pytestmark = pytest.mark.slow
 
@@ -50,9 +49,8 @@ RUNS = {
 @cache
 def composed(script, *options):
     """The configuration of a script that writes a checkpoint wherever it may."""
-    with initialize_config_dir(str(SCRIPTS / script / "config"), version_base="1.3"):
-        often = ("checkpoint.interval=0", "checkpoint.max_share=1", "resume=auto")
-        return compose("config", [*often, *options])
+    often = ("checkpoint.interval=0", "checkpoint.max_share=1", "resume=auto")
+    return compose_options(SCRIPTS / script, [*often, *options])
 
 
 def fork(directory, script, *options):
@@ -86,17 +84,6 @@ def finish(directory, *run):
 def number_of_rows(directory):
     path = directory / "metrics.csv"
     return path.read_bytes().count(b"\n") - 1 if path.exists() else 0
-
-
-def weights(directory):
-    path = max((directory / "checkpoints").glob("checkpoint-*"))
-    component = Checkpoint.manifest(path)["components"]["loss_module"]
-    return torch.load(path / component["path"] / "state.pt")
-
-
-def assert_same_run(one, other):
-    assert record(one) == record(other)
-    torch.testing.assert_close(weights(one), weights(other), rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("name", RUNS)
@@ -159,10 +146,6 @@ def spoil(path, other, generator):
         file.write_bytes(content)
     is_other_manifest = kind == "another checkpoint's file" and file.parent == path
     return kind, "state.pt" if is_other_manifest else file.relative_to(path).as_posix()
-
-
-def contents(directory):
-    return {path: path.is_file() and path.read_bytes() for path in directory.rglob("*")}
 
 
 def test_a_hundred_damages(tmp_path, capsys):

@@ -335,13 +335,13 @@ class Head(NamedTuple):
             size = 2 * spec.shape[-1]
             return cls(size, ["loc", "scale"], NormalParamExtractor(), TanhNormal, bounds)
         if spec.ndim == len(one):
-            return cls(space.n, ["logits"], Alone(), Categorical, {})
+            return cls(space.n, ["logits"], nn.Identity(), Categorical, {})
         if isinstance(spec, MultiCategorical):
             first: Any = spec[one]  # pyright: ignore[reportArgumentType] - it takes a tuple
             nvec = first.nvec.tolist()
         else:
             nvec = [space.n] * spec.shape[-1]
-        return cls(sum(nvec), ["logits"], Alone(), Choices, {"nvec": nvec})
+        return cls(sum(nvec), ["logits"], nn.Identity(), Choices, {"nvec": nvec})
 
 
 class Split(nn.Module):
@@ -355,15 +355,8 @@ class Split(nn.Module):
     def forward(self, outputs: Tensor) -> tuple[Tensor, ...]:
         """From ``[..., n]``."""
         of_heads = zip(self.splits, outputs.split(self.sizes, -1), strict=True)
-        return tuple(part for split, own in of_heads for part in split(own))
-
-
-class Alone(nn.Module):
-    """The outputs are the one parameter."""
-
-    def forward(self, outputs: Tensor) -> tuple[Tensor]:
-        """As they are."""
-        return (outputs,)
+        parts = (split(own) for split, own in of_heads)
+        return tuple(p for own in parts for p in (own if isinstance(own, tuple) else (own,)))
 
 
 def feed_forward(

@@ -5,11 +5,13 @@ from __future__ import annotations
 import csv
 from collections import defaultdict
 from pathlib import Path
-from statistics import fmean, stdev
+from statistics import fmean
 
 import matplotlib
+import numpy as np
 from matplotlib.figure import Figure
 
+from torchrl_ecpo.experiment.compare import with_error
 from torchrl_ecpo.experiment.figures import NEUTRAL, STYLE, colours_of, save_figure
 
 ROOT = Path(__file__).parents[2]
@@ -45,12 +47,10 @@ def at_the_start(rows: list[dict[str, float]]) -> dict[str, float]:
 
 def cells(ends: list[dict[str, float]]) -> str:
     """Means over runs with standard errors, as the columns of a table."""
-    texts = []
-    for name in METRICS:
-        values, digits = [end[name] for end in ends], 3 if name.startswith("pass") else 2
-        error = f" ± {stdev(values) / len(values) ** 0.5:.{digits}f}" if len(values) > 1 else ""
-        texts.append(f"{fmean(values):.{digits}f}{error}")
-    return " | ".join(texts)
+    specs = {name: ".3f" if name.startswith("pass") else ".2f" for name in METRICS}
+    return " | ".join(
+        with_error(np.array([end[name] for end in ends]), spec) for name, spec in specs.items()
+    )
 
 
 def table(study: str) -> list[str]:

@@ -23,7 +23,7 @@ from scores import (
     steps_to_solve,
 )
 
-from torchrl_ecpo.experiment.compare import Curve, area, final
+from torchrl_ecpo.experiment.compare import Curve, area, final, with_error
 from torchrl_ecpo.experiment.figures import (
     NEUTRAL,
     STYLE,
@@ -95,17 +95,15 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
 
 
-def with_error(values: np.ndarray) -> str:
+def in_digits(values: np.ndarray) -> str:
     """Mean and standard error, with as many digits as the size of the mean asks for.
 
     Examples:
-        >>> with_error(np.array([10.0, 14.0]))
+        >>> in_digits(np.array([10.0, 14.0]))
         '12.0 ± 2.0'
     """
-    mean = values.mean()
-    digits = 3 if abs(mean) < 2 else 1 if abs(mean) < 200 else 0
-    error = f" ± {values.std(ddof=1) / len(values) ** 0.5:,.{digits}f}" if len(values) > 1 else ""
-    return f"{mean:,.{digits}f}{error}"
+    size = abs(values.mean())
+    return with_error(values, f",.{3 if size < 2 else 1 if size < 200 else 0}f")
 
 
 def in_ranges(seeds: Iterable[int]) -> str:
@@ -194,7 +192,7 @@ def solved_table(study: Study, cells: Sequence[CellResult]) -> str:
 
 def scores(count: str, curve: Curve, threshold: float | None) -> list[str]:
     """What the columns `SCORES` say of some runs."""
-    cells = [count, with_error(area(*curve)), with_error(final(*curve))]
+    cells = [count, in_digits(area(*curve)), in_digits(final(*curve))]
     if threshold is None:
         return [*cells, "", ""]
     needed = steps_to_solve(*curve, threshold)
@@ -273,7 +271,7 @@ def ranking(study: Study, cells: Sequence[CellResult]) -> str:
     for group in groups_of(cells):
         scored = [(score(*result.scored), result) for result in group if result.scored]
         scored.sort(key=lambda pair: -pair[0].mean())
-        best = [f"{r.cell.label}: {with_error(s)} ({r.count} runs)" for s, r in scored[:BEST]]
+        best = [f"{r.cell.label}: {in_digits(s)} ({r.count} runs)" for s, r in scored[:BEST]]
         best += [""] * (BEST - len(best))
         searched = f"{len(scored)} of {len(group)}"
         rows.append([group[0].title, group[0].cell.method, searched, *best])

@@ -61,11 +61,8 @@ def test_a_dense_network_computes_what_an_mlp_does(hidden, dtype, is_normal):
 
 @pytest.mark.parametrize(("rows", "units"), [(4, 8), (64, 64)])
 def test_each_of_several_sets_of_parameters_gives_what_vmap_does(rows, units):
-    torch.manual_seed(0)
-    network = DenseNetwork(["a", "b"], ["out"], [60, units, 2])
-    params = TensorDict.from_modules(network, DenseNetwork(["a", "b"], ["out"], [60, units, 2]))
-    params = params.data.requires_grad_()
-    b = torch.randn(rows, 20, requires_grad=True)
+    network, params = two_sets(units)
+    b = torch.randn(rows, 36, requires_grad=True)
     inputs = TensorDict({"a": torch.randn(rows, 40), "b": b}, [rows])
 
     def call(params):

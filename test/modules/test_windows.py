@@ -6,7 +6,6 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
-from torch.func import functional_call
 from torch.nn import functional as F
 from torch.testing import assert_close
 from torchrl.envs import TransformedEnv
@@ -107,18 +106,6 @@ def test_pasts_are_read_out_by_the_weights_of_then(window: int, is_tabular: bool
         expected = network.read(data).output
     assert pasts is not None
     assert_close(network.read_out(pasts), expected)
-
-
-def test_gradients(is_tabular: bool) -> None:
-    network, data = make_network(2), sequences()[:3, :3]
-    names = [name for name, _ in network.named_parameters()]
-
-    def run(*values: torch.Tensor) -> torch.Tensor:
-        with set_recurrent_mode(True):
-            parameters = dict(zip(names, values, strict=True))
-            return functional_call(network, parameters, (data.clone(),))["embed"]
-
-    assert torch.autograd.gradcheck(run, tuple(network.parameters()))
 
 
 @pytest.mark.parametrize("window", [1, 2, 3, 5])

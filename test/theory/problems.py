@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import pytest
 import torch
 from hypothesis import strategies as st
 from torch import Tensor
@@ -96,6 +97,8 @@ PROBLEMS = [
     for size in (BANDIT, MDP)
     for family in ("tabular", "linear", "hidden")
 ]
+ONE_LAYER = [problem for problem in PROBLEMS if not problem.name.startswith("hidden")]
+one_layer = pytest.mark.parametrize("problem", ONE_LAYER, ids=lambda problem: problem.name)
 
 temperatures = st.floats(-2, 1).map(lambda exponent: 10.0**exponent)
 """Positive, from 0.01 to 10."""

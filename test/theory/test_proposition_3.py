@@ -9,13 +9,11 @@ from __future__ import annotations
 import pytest
 import torch
 from hypothesis import given
-from problems import PROBLEMS, Problem, kl, seeds
+from problems import ONE_LAYER, PROBLEMS, Problem, kl, one_layer, seeds
 from torch import Tensor
 
 from torchrl_ecpo.functional import mean_seeking_projection
 
-ONE_LAYER = [p for p in PROBLEMS if not p.name.startswith("hidden")]
-one_layer = pytest.mark.parametrize("problem", ONE_LAYER, ids=lambda p: p.name)
 hidden = pytest.mark.parametrize(
     "problem", [p for p in PROBLEMS if p not in ONE_LAYER], ids=lambda p: p.name
 )

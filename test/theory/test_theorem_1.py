@@ -20,8 +20,6 @@ from torch.testing import assert_close
 
 from torchrl_ecpo.functional import lifted_log_weights, theorem1_temperatures
 
-Projection = Callable[[Tensor], Tensor]
-
 
 def bisect(excess: Callable[[Tensor], Tensor], low: Tensor, high: Tensor) -> Tensor:
     """Where the decreasing function changes its sign."""

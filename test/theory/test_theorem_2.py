@@ -18,6 +18,7 @@ from problems import (
     kl,
     mean_seeking_loss,
     minimise,
+    one_layer,
     seeds,
     target,
     temperatures,
@@ -25,10 +26,6 @@ from problems import (
 from torch.testing import assert_close
 
 from torchrl_ecpo.functional import surrogate_reward
-
-one_layer = pytest.mark.parametrize(
-    "problem", [p for p in PROBLEMS if not p.name.startswith("hidden")], ids=lambda p: p.name
-)
 
 
 @given(tau=st.just(0.0) | temperatures, tau_prime=temperatures, seed=seeds)

@@ -69,8 +69,8 @@ class Comparison:
             steps, values = self.curves[method]
             means, ends = area(steps, values), final(steps, values)
             lines.append(
-                f"| {method} | {len(ends)} | {int(steps[-1]):,} | {_with_error(means)} "
-                f"| {_with_error(ends)} | {ends.min():.3f} |"
+                f"| {method} | {len(ends)} | {int(steps[-1]):,} | {with_error(means)} "
+                f"| {with_error(ends)} | {ends.min():.3f} |"
             )
         return "\n".join(lines)
 
@@ -101,9 +101,15 @@ def final(steps: np.ndarray, values: np.ndarray) -> np.ndarray:
     return values[:, is_late].mean(axis=1)
 
 
-def _with_error(values: np.ndarray) -> str:
-    error = f" ± {values.std(ddof=1) / np.sqrt(len(values)):.3f}" if len(values) > 1 else ""
-    return f"{values.mean():.3f}{error}"
+def with_error(values: np.ndarray, spec: str = ".3f") -> str:
+    """Mean and standard error, of several values, in a format.
+
+    Examples:
+        >>> with_error(np.array([10.0, 14.0]), ".1f")
+        '12.0 ± 2.0'
+    """
+    error = f" ± {values.std(ddof=1) / np.sqrt(len(values)):{spec}}" if len(values) > 1 else ""
+    return f"{values.mean():{spec}}{error}"
 
 
 def find_runs(directories: Sequence[Path]) -> list[Path]:

@@ -56,14 +56,14 @@ ORANGE, SKY, PURPLE, BROWN = "#E69F00", "#56B4E9", "#7B5FD0", "#9C6240"
 COLOURS = (BLUE, GREEN, RED, PINK, ORANGE, SKY, PURPLE, BROWN)
 """Those that are given to methods without one in the table."""
 METHOD_COLOURS = {
-    **dict.fromkeys(("ecpo", "ecac", "ecacphi04", "centred", "centredscale", "meanseeking"), BLUE),
+    **dict.fromkeys(("ecpo", "ecac", "ecacphi04", "centred"), BLUE),
     **dict.fromkeys(("urex", "sac", "sacphi04", "noprojection", "referencekept"), GREEN),
     **dict.fromkeys(("ment", "td3", "tau0", "dqn"), RED),
     **dict.fromkeys(("tpo", "ddpg", "plainreturns", "eq11"), PINK),
     **dict.fromkeys(("drgrpo", "grpo", "freshbatches", "k5andm5"), ORANGE),
     **dict.fromkeys(("pmdentropy", "pmdacentropy", "smallstartat1e3"), ORANGE),
     **dict.fromkeys(("reps", "tables", "aselsewhereat3e4"), SKY),
-    **dict.fromkeys(("pmd", "pmdac", "squaredpmd", "kimispmd", "modeseeking"), PURPLE),
+    **dict.fromkeys(("pmd", "pmdac", "squaredpmd", "kimispmd"), PURPLE),
     **dict.fromkeys(("nocontrolvariate", "tau02", "lr003", "k5andm2"), PURPLE),
     **dict.fromkeys(("repsentropy", "lstm", "aselsewhereat1e3"), BROWN),
     **dict.fromkeys(("smallstartat3e4", "ofthegroup", "windowoffour"), BLUE),

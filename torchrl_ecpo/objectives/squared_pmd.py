@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from tensordict.nn import ProbabilisticTensorDictSequential
 
 from torchrl_ecpo.checks import check_choice
 from torchrl_ecpo.functional import Surrogate, squared_residual_projection
-from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, Score, TrajectoryGroups
+from torchrl_ecpo.objectives.trajectory import LiftProjectLoss, TrajectoryGroups
 
 
 class SquaredPMDLoss(LiftProjectLoss):
@@ -56,21 +56,10 @@ class SquaredPMDLoss(LiftProjectLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         *,
-        tau: float = 0.5,
-        tau_prime: float = 0.0,
         normaliser: Literal["mean", "soft"] = "mean",
-        score: Score = "return",
-        delay_actor: bool = False,
-        reduction: Literal["none", "mean", "sum"] | None = None,
+        **options: Any,
     ) -> None:
-        super().__init__(
-            actor_network,
-            tau=tau,
-            tau_prime=tau_prime,
-            score=score,
-            delay_actor=delay_actor,
-            reduction=reduction,
-        )
+        super().__init__(actor_network, **options)
         check_choice("normaliser", normaliser, ("mean", "soft"))
         self.normaliser = normaliser
 

@@ -7,6 +7,6 @@ holds them one after another.
 """
 
 from stacked.options import check_runs, runs_of
-from stacked.training import Stack, train_stack
+from stacked.training import train_stack
 
-__all__ = ["Stack", "check_runs", "runs_of", "train_stack"]
+__all__ = ["check_runs", "runs_of", "train_stack"]
