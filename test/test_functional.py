@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -1413,6 +1414,9 @@ def test_path_consistency_by_hand(n_steps, masked, expected, dtype):
         tensor[2] = math.nan
     options = {"tau": 0.5, "tau_prime": 0.25, "gamma": 0.5, "n_steps": n_steps, "mask": mask}
     assert_close(path_consistency(*tensors, **options), vector(*expected, dtype=dtype))
+    if not masked:
+        tensors[0], options["n_steps"] = tensors[0].int(), np.int64(n_steps)
+        assert_close(path_consistency(*tensors, **options), vector(*expected, dtype=dtype))
 
 
 @pytest.mark.parametrize(("tau", "tau_prime"), [(0.5, 0.25), (1.0, 0.0), (0.0, 0.3)])
@@ -1598,3 +1602,10 @@ def test_moments_of_one_sample_and_of_any_shape():
     moved = [x.unflatten(1, (3, 2)).movedim(0, 2) for x in lifts[:3]]
     actual = lifted_gaussian_moments(*moved, tau=1.0, tau_prime=0.5)
     assert_close([x.flatten(0, 1) for x in actual], list(expected))
+
+
+def test_there_must_be_samples():
+    none = torch.zeros(2, 0)
+    for call in (lambda: mean_seeking_projection(none, none), lambda: standardised(none)):
+        with pytest.raises(ValueError, match=r"There are no samples along -1 of \(2, 0\)"):
+            call()

@@ -54,6 +54,29 @@ def make_steps(trajectories, *, first_id=0, ended=True, traj_ids=True, is_init=F
     return steps.set("x", torch.arange(len(steps)) + 1000 * first_id)
 
 
+@pytest.mark.parametrize("as_lazy_stack", [False, True])
+def test_trajectories_of_unequal_length(as_lazy_stack):
+    """One tensordict each; they are not taken for one where the first has no end."""
+    lengths = ((7, 3), (7, 2), (3, 1), (3, 4))
+    rows = [make_steps([each], traj_ids=False) for each in lengths]
+    groups = pack_groups(LazyStackedTensorDict.lazy_stack(rows) if as_lazy_stack else rows)
+    assert groups[MASK].sum(-1).tolist() == [[3, 2], [1, 4]]
+    assert_close(unpack_groups(groups).exclude("collector"), torch.cat(rows))
+    rows[0][DONE][-1] = False
+    assert pack_groups([row.exclude(DONE) for row in rows])[MASK].sum(-1).tolist() == [
+        [3, 2],
+        [1, 4],
+    ]
+    with pytest.raises(ValueError, match=r"must be a tensordict \[T\], got one of shape \(1, 3\)"):
+        pack_groups([rows[0].unsqueeze(0)])
+    with pytest.raises(TypeError, match="a trajectory must be a TensorDictBase, got"):
+        pack_groups([1])
+    with pytest.raises(TypeError, match="data must be a TensorDictBase or list or tuple, got"):
+        pack_groups(1)
+    with pytest.raises(ValueError, match="got no trajectories"):
+        pack_groups([])
+
+
 def make_buffer(size=100, *, storage=LazyTensorStorage, seed=0, batch_size=4, **options):
     return TensorDictReplayBuffer(
         storage=storage(size),

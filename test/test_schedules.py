@@ -1,12 +1,13 @@
 from __future__ import annotations
 
 import pickle
+from functools import partial
 
 import pytest
 import torch
 from torchrl.objectives import LossModule
 
-from torchrl_ecpo import ECPOLoss, REPSLoss
+from torchrl_ecpo import ECPOLoss
 from torchrl_ecpo.functional import theorem1_temperatures
 from torchrl_ecpo.modules import make_softmax_policy
 from torchrl_ecpo.schedules import (
@@ -125,13 +126,6 @@ def test_a_step_that_is_refused_changes_nothing():
     assert loss.tau.item() == pytest.approx(0.34)
 
 
-def test_what_is_learned_is_not_scheduled():
-    """Also where it would end at what is not allowed."""
-    loss = REPSLoss(make_softmax_policy(torch.eye(4)))
-    with pytest.raises(AttributeError, match="tau is learned"):
-        TemperatureScheduler(loss, tau=linear(1.0, 0.0, 100))
-
-
 @pytest.mark.parametrize(
     ("setting", "at_five"),
     [
@@ -159,3 +153,9 @@ def test_schedule_from_a_configuration(setting, at_five):
 def test_bad_input_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_a_schedule_of_one_s_own_may_have_any_options():
+    """Its `end` need not be a temperature."""
+    loss = ECPOLoss(make_softmax_policy(torch.eye(4)))
+    TemperatureScheduler(loss, tau=partial(lambda count, end: 0.5 + count * end, end=-1))

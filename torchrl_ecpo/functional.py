@@ -145,6 +145,8 @@ def _check_samples(
         )
     if sample_dim is not None:
         axis = _axis(sample_dim, shape)
+        if not shape[axis]:
+            raise ValueError(f"There are no samples along {sample_dim} of {tuple(shape)}.")
         for name, value in tensors.items():
             size = value.shape[axis] if value.ndim >= -axis else None
             wanted = (1, None) if name in TEMPERATURES else (shape[axis],)
@@ -191,7 +193,7 @@ def _fits(shape: torch.Size, whole: torch.Size) -> bool:
 
 def _is_score(name: str, value: Tensor) -> bool:
     """Rewards may be integers."""
-    return name == "score" and not value.is_complex() and value.dtype != torch.bool
+    return name in ("score", "rewards") and not value.is_complex() and value.dtype != torch.bool
 
 
 def _is_number(value: object) -> bool:
@@ -470,12 +472,11 @@ def centred_gaussian_projection(
         (tensor([-2.]), tensor([-1.]))
     """
     _check_samples(sample_dim, log_weights=log_weights)
-    _check_samples(loc=loc)
     dim = sample_dim % log_weights.ndim
     each, one = log_weights.shape, log_weights.select(dim, 0).shape
     of_each = {"loc": (loc, one), "scale": (scale, one), "samples": (samples, each)}
     for name, (value, shape) in of_each.items():
-        _check_samples(None, None, **{name: value})
+        _check_samples(**{name: value})
         if value.shape[:-1] != shape or value.shape[-1:] != loc.shape[-1:]:
             raise ValueError(
                 f"{name} must have the shape {tuple(shape)} and an axis of A more, as "
@@ -567,8 +568,8 @@ def lifted_gaussian_moments(
 
     with sums over ``E*``. c = 0 is the estimate by samples alone; at its upper bound they have no
     part but in the weights, and :math:`\delta = \langle \nabla f \rangle / \tau`. Where f is
-    linear, or quadratic with the same curvature everywhere, both are exact, whatever the weights
-    are. Not in the paper; ours.
+    linear, or quadratic, concave and of the same curvature everywhere, both are exact, whatever the
+    weights are. Not in the paper; ours.
 
     Args:
         samples: ``[E*, M, A]`` with the sample axis where ``sample_dim`` has it in the weights: x,
@@ -602,7 +603,7 @@ def lifted_gaussian_moments(
     _check_samples(sample_dim, log_weights=log_weights)
     dim, each = sample_dim % log_weights.ndim, log_weights.shape
     for name, value in {"samples": samples, "slope": slope}.items():
-        _check_samples(None, None, **{name: value})
+        _check_samples(**{name: value})
         if value.shape[:-1] != each or value.shape != samples.shape:
             raise ValueError(
                 f"{name} must have the shape {tuple(each)} of log_weights and an axis of A more, "
@@ -998,7 +999,7 @@ def path_consistency(
     _check_samples(-1, mask, **tensors, values=values, tau=tau, tau_prime=tau_prime)
     if not (_is_number(gamma) and 0 <= gamma <= 1):
         raise ValueError(f"gamma must be a number from 0 to 1, got {gamma!r}.")
-    if not isinstance(n_steps, int) or isinstance(n_steps, bool) or n_steps < 1:
+    if not isinstance(n_steps, (int, np.integer)) or isinstance(n_steps, bool) or n_steps < 1:
         raise ValueError(f"n_steps must be an integer of at least 1, got {n_steps!r}.")
     gains = rewards - (tau + tau_prime) * log_prob + tau * reference_log_prob
     gains, values = torch.broadcast_tensors(gains, values)
@@ -1120,8 +1121,8 @@ def theorem1_temperatures(horizon: float, num_trajectories: int) -> tuple[float,
         num_trajectories: n, how many trajectories there are; at least 2.
 
     Returns:
-        (tau, tau_prime), for rewards in [0, 1]. Where the formula has tau < 0, at T = 1, it is 0
-        and tau_prime the whole sum, on which alone the lift of the uniform start depends.
+        (tau, tau_prime), for rewards in [0, 1]. Where the formula has tau < 0, for T < 1.41, it is
+        0 and tau_prime the whole sum, on which alone the lift of the uniform start depends.
 
     Raises:
         ValueError: if ``horizon`` < 1 or ``num_trajectories`` < 2.
@@ -1278,7 +1279,7 @@ def matched_temperature(
         score: ``[E*, K]``, of unit deviation within their group or in the batch.
 
     Returns:
-        0-d.
+        0-d, or as tau_prime is.
 
     Examples:
         Scores of deviation 1, surprise of deviation 2, a single group:

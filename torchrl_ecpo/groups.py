@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import weakref
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +30,7 @@ from torchrl_ecpo._torchrl import buffers_of, generator_of
 from torchrl_ecpo.checks import (
     check_flag,
     check_group_size,
+    check_kind,
     check_mask,
     check_padding,
     present,
@@ -44,7 +46,7 @@ INIT_KEY: NestedKey = "is_init"
 
 
 def pack_groups(
-    data: TensorDictBase,
+    data: TensorDictBase | Sequence[TensorDictBase],
     *,
     group_size: int | None = None,
     group_key: NestedKey = GROUP_KEY,
@@ -65,6 +67,8 @@ def pack_groups(
               trajectory ends where `done_key` is set; `traj_key` tells trajectories apart whose
               steps are interleaved. One of the two must be there. Steps that `mask_key` marks as
               padding are left out.
+            - trajectories of unequal length, one tensordict `[T]` each, in a list or a lazy stack:
+              `traj_key` numbers them afterwards,
             - padded trajectories `[N, T]`, one to a row,
             - groups `[*G, K, T]`, which are checked and returned with their mask.
 
@@ -100,6 +104,7 @@ def pack_groups(
     """
     if group_size is not None:
         check_group_size(group_size)
+    data = _joined(data, traj_key, group_key)
     if data.ndim == 0:
         raise ValueError("pack_groups needs steps [S], trajectories [N, T] or groups [*G, K, T].")
     mask = data.get(mask_key, None)
@@ -176,6 +181,29 @@ def unpack_groups(data: TensorDictBase, *, mask_key: NestedKey = MASK_KEY) -> Te
         data = data.contiguous()
     # A copy of the structure, from which empty entries go: what is nested in it is the caller's.
     return data.exclude(mask_key).copy().filter_empty_().reshape(-1)[real]
+
+
+def _joined(data: Any, traj_key: NestedKey, group_key: NestedKey) -> TensorDictBase:
+    """Several trajectories one after another, numbered; anything else as it is."""
+    if isinstance(data, LazyStackedTensorDict) and -1 in data.batch_size:
+        data = data.unbind(data.stack_dim)
+    if isinstance(data, TensorDictBase):
+        return data
+    check_kind("data", data, TensorDictBase, list, tuple)
+    if not data:
+        raise ValueError("pack_groups got no trajectories.")
+    rows: Any = []
+    for number, row in enumerate(data):
+        check_kind("a trajectory", row, TensorDictBase)
+        if row.ndim != 1:
+            raise ValueError(
+                "Each of several trajectories must be a tensordict [T], got one of shape "
+                f"{tuple(row.shape)}."
+            )
+        device = None if (group := row.get(group_key, None)) is None else group.device
+        rows.append(row.copy().set(traj_key, torch.full(row.shape, number, device=device)))
+    joined: Any = torch.cat(rows)
+    return joined
 
 
 def _read_steps(

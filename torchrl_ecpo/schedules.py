@@ -164,7 +164,7 @@ class TemperatureScheduler:
         self.loss_module = loss_module
         self.schedules = schedules
         if isinstance(loss_module, PolicyLoss):
-            ends = {name: getattr(s, "keywords", {}).get("end") for name, s in schedules.items()}
+            ends = {name: _end_of(schedule) for name, schedule in schedules.items()}
             try:
                 loss_module.allowed_temperatures(**ends)
             except ValueError as error:
@@ -224,6 +224,11 @@ def _schedule(function: Callable[..., float], **numbers: Any) -> Schedule:
     if not numbers["duration"] > 0:
         raise ValueError(f"duration must be positive, got {numbers['duration']}.")
     return partial(function, **numbers)
+
+
+def _end_of(schedule: Schedule) -> float | None:
+    is_known = isinstance(schedule, partial) and schedule.func in (_linear, _exponential)
+    return schedule.keywords["end"] if is_known else None
 
 
 def _number(name: str, value: Any) -> float:

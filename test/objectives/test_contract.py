@@ -95,7 +95,8 @@ def test_default_keys(case):
     """As documented, in this order: with sets it would depend on the seed of the hashes."""
     loss = build(case)
     assert {f: getattr(loss.tensor_keys, f) for f in DEFAULTS} == DEFAULTS
-    rest = ["action", ("next", "reward"), "action_log_prob", MASK]
+    rest = ["action", ("next", "reward"), "action_log_prob", MASK, "shifted_valid"]
+    rest += [("next", "done"), "group", "steps_to_next_obs"]
     assert loss.in_keys == ["observation", *rest]
     recurrent = ["observation", "recurrent_state_h", "recurrent_state_c", "is_init"]
     assert build(case, "lstm").in_keys == [*recurrent, *rest]

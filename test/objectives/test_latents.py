@@ -171,7 +171,7 @@ def test_a_composite_action_has_latents_of_its_own():
         assert (("agent", "force_latent") in batch.keys(True)) is latents
         loss = ECPOLoss(actor)
         loss.set_keys(action=[("agent", "force"), "gain"])
-        assert loss.in_keys[-2] == ("agent", "force_latent")
+        assert ("agent", "force_latent") in loss.in_keys
         batch = batch.exclude("params") if latents else batch
         assert loss(batch)["kl_reference_policy"].item() == pytest.approx(0, abs=1e-4)
 
@@ -189,7 +189,7 @@ def test_recording_changes_nothing_else():
     for copy in (deepcopy(other), pickle.loads(pickle.dumps(other))):
         assert_close(draw(copy), batch, rtol=0, atol=0)
     loss = ECPOLoss(actor)
-    assert loss.in_keys[-1] == "action_latent"
+    assert "action_latent" in loss.in_keys
     assert_close(loss(**as_keywords(loss, batch))[0], loss(batch)["loss_actor"])
 
 

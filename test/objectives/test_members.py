@@ -175,18 +175,24 @@ def test_returns_have_no_deviation_to_match(loss_class):
         loss_class(make_actor(), entropy="matched")
 
 
-def test_projection_reaches_the_minimum_of_the_cross_entropy():
-    """Solved, the projection's loss is the entropy of the weights (a policy that can be them)."""
+def at_the_target(weights):
+    """Four actions, each drawn once by a uniform policy; a policy that is the target already."""
     actor = make_actor()
-    weights = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
     batch = sample(actor, 4, 1)
     batch["observation"].zero_()
     batch["action"] = torch.arange(4).unsqueeze(-1)
     batch["action_log_prob"].fill_(0.25).log_()
-    loss = CASE.build(actor)
-    loss.tau, loss.tau_prime = 1.0, 0.0
     batch["next", "reward"] = weights.log().view(4, 1, 1)
     actor.module[0].module[0].bias.data.copy_(weights.log())  # type: ignore
+    return actor, batch
+
+
+def test_projection_reaches_the_minimum_of_the_cross_entropy():
+    """Solved, the projection's loss is the entropy of the weights (a policy that can be them)."""
+    weights = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
+    actor, batch = at_the_target(weights)
+    loss = CASE.build(actor)
+    loss.tau, loss.tau_prime = 1.0, 0.0
     value = loss(batch)["loss_actor"]
     assert_close(value, -(weights * weights.log()).sum())
     assert max(g.abs().max() for g in gradients(value, actor)) < 1e-12
@@ -364,15 +370,8 @@ def test_tpo_has_ecpos_weights_with_the_entropy_term_of_the_other_sign(score):
 @pytest.mark.parametrize("normaliser", ["mean", "soft"])
 def test_squared_pmd_is_zero_at_its_target_with_the_soft_normaliser(normaliser):
     """With the mean return it is 0 only where the lift is small."""
-    actor = make_actor()
-    batch = sample(actor, 4, 1)
-    batch["observation"].zero_()
-    batch["action"] = torch.arange(4).unsqueeze(-1)
-    batch["action_log_prob"].fill_(0.25).log_()
+    actor, batch = at_the_target(torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64))
     loss = SquaredPMDLoss(actor, tau=1.0, normaliser=normaliser).double()
-    weights = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
-    batch["next", "reward"] = weights.log().view(4, 1, 1)
-    actor.module[0].module[0].bias.data.copy_(weights.log())  # type: ignore
     assert (loss(batch)["loss_actor"].item() < 1e-20) is (normaliser == "soft")
 
 
@@ -459,6 +458,10 @@ def test_what_reps_refuses():
         ValueError, match=r"epsilon must be below log K = 1\.1, .* of 3 goes, got 1\.2"
     ):
         REPSLoss(make_actor(), epsilon=1.2)(sample(make_actor(), 2, 3, 4))
+    with pytest.raises(ValueError, match=r"epsilon must be below log K = 0\.693"):
+        REPSLoss(make_actor(), epsilon=1.0)(pad(sample(make_actor(), 2, 3, 4), masked=(0,)))
+    with pytest.raises(ValueError, match=r"tau must be in \(0, inf\), got 0"):
+        REPSLoss(make_actor(), tau=0.0, tau_prime=0.1)
     loss = REPSLoss(make_actor())
     with pytest.raises(AttributeError, match="tau is learned"):
         loss.tau = 0.5

@@ -202,10 +202,11 @@ def test_own_mask_key():
     """loss_mask_key names the entry, with or without a trailing dimension; others are ignored."""
     loss, _, batch = problem(ECPO)
     expected, mask = loss(batch), batch[MASK]
-    assert loss.in_keys[-1] == MASK
+    assert MASK in loss.in_keys
     batch[MASK] = torch.zeros_like(mask)
     loss.loss_mask_key = ("masks", "valid")
-    assert loss.in_keys[-1] == ("masks", "valid")
+    assert ("masks", "valid") in loss.in_keys
+    assert MASK not in loss.in_keys
     for values in (mask, mask.unsqueeze(-1)):
         batch["masks", "valid"] = values
         assert_close(loss(batch), expected)
@@ -219,7 +220,7 @@ def test_no_mask_key():
     loss, _, batch = problem(ECPO, padded=False)
     expected = loss(batch)
     loss.loss_mask_key = None
-    assert loss.in_keys[-1] == "action_log_prob"
+    assert MASK not in loss.in_keys
     assert_close(loss(batch.set(MASK, torch.zeros(2, 3, 4, dtype=torch.bool))), expected)
 
 
@@ -251,6 +252,14 @@ def test_delayed_reference_without_recorded_log_prob(case):
     """Nothing recorded: the data is taken to be the reference's, that is, the target's."""
     loss, actor, batch = problem(case, padded=False, delay_actor=True)
     assert_close(loss(batch.exclude("action_log_prob")), case.build(actor)(batch))
+
+
+def test_steps_of_a_policy_may_have_names():
+    loss, actor, batch = problem(ECPO, "part_by_part")
+    named = ProbabilisticTensorDictSequential({str(n): step for n, step in enumerate(actor.module)})
+    other = ECPO.build(named)
+    other.set_keys(**ACTOR_KEYS["part_by_part"])
+    assert_close(other(batch)["loss_actor"], loss(batch)["loss_actor"])
 
 
 def test_nested_parts_of_an_action_are_summed():
@@ -506,6 +515,8 @@ def test_batches_of_any_kind():
         assert_close(loss(lazy_stack(list(batch.unbind(dim)), dim)), expected)
         masked = list(batch.clone().update(whole).unbind(dim))
         assert_close(loss(lazy_stack(masked, dim)), expected)
+    rows = [TensorDict(row.to_dict(), row.shape[:1]) for row in batch.unbind(0)]
+    assert_close(loss(lazy_stack(rows)), expected)
     for lock in ("lock_", "memmap_", "share_memory_"):
         assert_close(loss(getattr(batch.clone(), lock)()), expected)
 
@@ -643,6 +654,10 @@ BAD_BATCHES = {
         *(_set(REWARD, lambda x: x.cfloat()), ValueError),
         r"\('next', 'reward'\) must hold real numbers, got torch.complex64",
     ),
+    "trajectories of two groups": (
+        *(_set("group", torch.arange(3).expand(2, 3)), ValueError),
+        r"4 rows of the batch.* are of another group \('group'\) than others",
+    ),
     "rows of two groups": (
         *(_set("group", torch.arange(3).expand(2, 3).unsqueeze(-1).expand(2, 3, 4)), ValueError),
         r"4 rows of the batch.* are of another group \('group'\) than others",
@@ -654,6 +669,10 @@ BAD_BATCHES = {
     "rows that go on after an end": (
         *(_poke(("next", "done"), True), ValueError),
         r"1 rows of the batch.* go on after an end \(\('next', 'done'\)\)",
+    ),
+    "rows of unequal length": (
+        lambda b: lazy_stack([b[0, 0], b[0, 1, :2]]),
+        *(ValueError, r"rows of the batch \(2, -1\) are of unequal length: .*pack_groups"),
     ),
     "observation of another length": (
         *(_set("observation", lambda x: x[..., :2]), ValueError),
@@ -696,6 +715,22 @@ def test_bad_batch(name):
         ECPO.build(actor)(batch)
 
 
+@pytest.mark.parametrize(
+    ("kind", "action", "expected"),
+    [
+        ("one_hot", torch.zeros(2, 3, 4, dtype=torch.int64), "6, 4, 4"),
+        ("one_hot", torch.zeros(2, 3, 4, 1), "6, 4, 4"),
+        ("normal", torch.zeros(2, 3, 4, 1), "6, 4, 2"),
+        ("normal", torch.zeros(2, 3, 4, 3), "6, 4, 2"),
+    ],
+)
+def test_action_of_another_shape(kind, action, expected):
+    """It might broadcast to what the distribution takes."""
+    loss, _, batch = problem(ECPO, kind, padded=False)
+    with pytest.raises(ValueError, match=rf"'action' must have the shape \({expected}\) of what a"):
+        loss(batch.set("action", action))
+
+
 @pytest.mark.parametrize("masked", [False, True])
 def test_one_step_problems_without_a_time_axis(masked):
     """[G, K] of steps that are ends all: groups of K, not one group of G."""
@@ -708,6 +743,12 @@ def test_one_step_problems_without_a_time_axis(masked):
     out = loss(batch)
     assert out.shape == (2,)
     assert_close(out, loss(batch.unsqueeze(-1)))
+    assert_close(out, loss(batch.select(*loss.in_keys, strict=False)))
+    given = {key if isinstance(key, str) else "_".join(key): batch.get(key) for key in loss.in_keys}
+    by_keywords = loss(**{name: value for name, value in given.items() if value is not None})
+    assert_close(by_keywords[0], out["loss_actor"])
+    shallow = TensorDict(batch.to_dict()).set("epoch", torch.tensor(3))
+    assert_close(loss(shallow)["loss_actor"], out["loss_actor"])
 
 
 def test_one_group_of_one_step_problems():

@@ -12,7 +12,7 @@ from torch import nn
 from torch.distributions import Categorical
 from torch.testing import assert_close
 from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
-from trajectory_problems import OBSERVATION, make_actor, move, pad, sample, split
+from trajectory_problems import MASK, OBSERVATION, make_actor, move, pad, sample, split
 
 from torchrl_ecpo import PolyakAverage, TrustPCLLoss
 
@@ -48,6 +48,17 @@ def residuals(actor, value, reference, trajectory, *, gamma, n_steps):
             residual = residual + gamma ** (i - t) * gain
         found.append(residual)
     return torch.stack(found)
+
+
+def test_a_trajectory_may_be_alone():
+    """They are not compared."""
+    batch = sample(make_actor(), 2, 3, 4)
+    loss = build(reduction="none")
+    expected = loss(batch)["loss_actor"]
+    each = [loss(batch[:, k : k + 1])["loss_actor"] for k in range(3)]
+    assert_close(torch.stack(each).mean(0), expected)
+    alone = batch.set(MASK, (torch.arange(3) == 1).view(1, 3, 1).expand(2, 3, 4))
+    assert_close(loss(alone)["loss_actor"], each[1])
 
 
 @pytest.mark.parametrize("padded", [False, True], ids=["whole", "padded"])

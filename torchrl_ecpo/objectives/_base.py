@@ -105,7 +105,7 @@ class PolicyLoss(LossModule):
         self, values: Mapping[str, Any], *, allow_zero: bool = False
     ) -> dict[str, float]:
         """Numbers, by name, that are allowed together."""
-        temperatures = {name: as_float(name, value) for name, value in values.items()}
+        temperatures = {name: _as_temperature(name, value) for name, value in values.items()}
         check_temperatures(allow_zero=allow_zero or self._allow_zero, **temperatures)
         return temperatures
 
@@ -117,12 +117,7 @@ class PolicyLoss(LossModule):
         if name not in buffers:
             super().__setattr__(name, value)
             return
-        if isinstance(value, Tensor) and value.requires_grad:
-            raise TypeError(
-                f"{name} is set to its present number, and would not be trained: learn it by "
-                f"learn({name!r}, start), or set value.item()."
-            )
-        buffers[name].fill_(self.allowed_temperatures(**{name: as_float(name, value)})[name])
+        buffers[name].fill_(self.allowed_temperatures(**{name: _as_temperature(name, value)})[name])
 
     def _refuse_learned(self, name: str) -> None:
         if name in self._learned:
@@ -155,16 +150,17 @@ class PolicyLoss(LossModule):
             instead: what to leave out so that it is not learned, for the message of who sets it.
 
         Raises:
-            ValueError: unless 0 < floor <= start.
+            ValueError: unless 0 < floor <= start < inf.
         """
-        if not 0 < floor <= start:
+        first = as_float(name, start)
+        if not 0 < floor <= first < math.inf:
             raise ValueError(
                 f"A learned {name} must start at min_{name} > 0 or above, got {name}={start} and "
                 f"min_{name}={floor}."
             )
         if name in dict(self.named_buffers(recurse=False)):
             delattr(self, name)
-        log_value = nn.Parameter(torch.tensor(math.log(start), device=self._device))
+        log_value = nn.Parameter(torch.tensor(math.log(first), device=self._device))
         self.register_parameter(f"log_{name}", log_value)
         self._learned = {**self._learned, name: (floor, instead)}
 
@@ -339,6 +335,16 @@ class PolicyLoss(LossModule):
                     f"{of}. Mend the environment, the observations or the networks that it comes "
                     "from."
                 )
+
+
+def _as_temperature(name: str, value: Any) -> float:
+    """A number; refuse one that would have to be trained."""
+    if isinstance(value, Tensor) and value.requires_grad:
+        raise TypeError(
+            f"{name} is set to its present number, and would not be trained: learn it by "
+            f"learn({name!r}, start), or set value.item()."
+        )
+    return as_float(name, value)
 
 
 def options_of(kind: type[PolicyLoss]) -> dict[str, Any]:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Any
 
 from tensordict.nn import ProbabilisticTensorDictSequential
 
-from torchrl_ecpo.checks import as_float
+from torchrl_ecpo.checks import as_float, values_can_be_seen
 from torchrl_ecpo.functional import Surrogate, lift_divergence_estimate, self_normalised_weights
 from torchrl_ecpo.objectives.ecpo import ECPOLoss
-from torchrl_ecpo.objectives.trajectory import Score, TrajectoryGroups
+from torchrl_ecpo.objectives.trajectory import TrajectoryGroups
 
 
 class REPSLoss(ECPOLoss):
@@ -66,30 +66,19 @@ class REPSLoss(ECPOLoss):
         epsilon: float = 0.5,
         tau: float = 1.0,
         tau_prime: float = 0.0,
-        entropy: Literal["nats", "matched"] = "nats",
-        control_variate: bool = False,
-        score: Score = "return",
-        delay_actor: bool = False,
-        reduction: Literal["none", "mean", "sum"] | None = None,
+        **options: Any,
     ) -> None:
-        super().__init__(
-            actor_network,
-            tau=tau,
-            tau_prime=tau_prime,
-            entropy=entropy,
-            control_variate=control_variate,
-            score=score,
-            delay_actor=delay_actor,
-            reduction=reduction,
-        )
+        super().__init__(actor_network, tau=tau, tau_prime=tau_prime, **options)
         self.epsilon = as_float("epsilon", epsilon)
         if not 0 < self.epsilon < math.inf:
             raise ValueError(f"epsilon must be above 0, in nats, got {epsilon!r}.")
-        self.learn("tau", float(tau))
+        self.learn("tau", as_float("tau", tau, "(0, inf)"))
 
     def surrogate(self, groups: TrajectoryGroups) -> Surrogate:
         """ECPO's, at the temperature that has been found."""
         size = groups.returns.shape[-1]
+        if groups.mask is not None and values_can_be_seen():
+            size = int(groups.mask.sum(-1).min())
         if self.epsilon >= math.log(size):
             raise ValueError(
                 f"epsilon must be below log K = {math.log(size):.3g}, which is as far as a lift of "

@@ -8,7 +8,12 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
-from tensordict import TensorDictBase, TensorDictParams, is_tensor_collection
+from tensordict import (
+    LazyStackedTensorDict,
+    TensorDictBase,
+    TensorDictParams,
+    is_tensor_collection,
+)
 from tensordict.nn import (
     CompositeDistribution,
     ProbabilisticTensorDictSequential,
@@ -18,8 +23,9 @@ from tensordict.nn import (
 )
 from tensordict.nn import ProbabilisticTensorDictModule as _Head
 from tensordict.utils import NestedKey
-from torch import Tensor
-from torch.distributions import Categorical
+from torch import Tensor, nn
+from torch.distributions import Categorical, Distribution
+from torchrl.modules import MaskedOneHotCategorical, OneHotCategorical
 
 from torchrl_ecpo._torchrl import holding
 from torchrl_ecpo.checks import (
@@ -63,6 +69,8 @@ SCORES = {
     "batch": standardised_in_batch,
 }
 Score = Literal["return", "group", "batch"]
+SPAN_KEY = "steps_to_next_obs"
+ONE_HOT = (OneHotCategorical, MaskedOneHotCategorical)
 OF_WEIGHTS = ("ESS", "max_weight")
 OF_GROUPS = ("kl_reference_policy", "entropy", "return", "equal_return_groups")
 
@@ -127,7 +135,8 @@ class TrajectoryGroups(NamedTuple):
 class TrajectoryGroupLoss(PolicyLoss):
     """Base class of the losses over groups of K trajectories of one problem instance.
 
-    It reads a batch ``[*G, K, T]`` (any number of group dimensions, also none), sums rewards and
+    It reads a batch ``[*G, K, T]`` (any number of group dimensions, also none; of one-step
+    trajectories also ``[*G, K]`` with one at least), sums rewards and
     log-probabilities over the real steps of each trajectory, in single precision at least, hands
     the numbers to :meth:`surrogate`, and reduces and reports what comes back. A new member of the
     family implements that one method, and declares in :attr:`losses` and :attr:`metrics` what else
@@ -190,13 +199,12 @@ class TrajectoryGroupLoss(PolicyLoss):
     Examples:
         A member in a few lines, REINFORCE with the mean of the other trajectories as baseline:
 
-        >>> from torchrl_ecpo.functional import centred, score_function_loss
+        >>> from torchrl_ecpo.functional import leave_one_out, score_function_loss
         >>> class RLOOLoss(TrajectoryGroupLoss):
         ...     metrics = ("advantage",)
         ...     def surrogate(self, groups):
-        ...         K = groups.scores.shape[-1]
-        ...         advantage = centred(groups.scores) * K / (K - 1)
-        ...         loss = score_function_loss(groups.log_prob, advantage)
+        ...         advantage = leave_one_out(groups.scores, mask=groups.mask)
+        ...         loss = score_function_loss(groups.log_prob, advantage, mask=groups.mask)
         ...         return Surrogate(loss, None, metrics={"advantage": advantage.abs().mean(-1)})
     """
 
@@ -210,6 +218,9 @@ class TrajectoryGroupLoss(PolicyLoss):
     reads_steps: bool = True
     """Whether ``surrogate`` reads ``groups.steps`` or ``groups.num_steps``. Of a loss that does
     not, the sums over a trajectory's steps may be handed in as a trajectory of one step."""
+
+    least_group: ClassVar[int] = 2
+    """Trajectories a group, at least: weights are relative to the others of the group."""
 
     further_in_keys: Sequence[NestedKey] = ()
     """Entries that networks of the member's own read from ``groups.steps.inputs``."""
@@ -325,19 +336,20 @@ class TrajectoryGroupLoss(PolicyLoss):
     @property
     def _all_in_keys(self) -> list[NestedKey]:
         actor: Any = self.actor_network
-        mask_keys = self.mask_keys[:1]
         if self._reads_completions:
-            mask_keys = () if self.loss_mask_key == "auto" else mask_keys  # prompts tell
-            mask_keys += ((actor.tokens_key, "prompt"), (actor.masks_key, "all_attention_mask"))
-            mask_keys += (self.tensor_keys.prompt,)
+            further = () if self.loss_mask_key == "auto" else self.mask_keys  # prompts tell
+            further += ((actor.tokens_key, "prompt"), (actor.masks_key, "all_attention_mask"))
+            further += (self.tensor_keys.prompt,)
+        else:
+            further = (*self.mask_keys, DONE_KEY, GROUP_KEY, SPAN_KEY)
         return [
             *actor.in_keys,
             *self.further_in_keys,
             *_as_list(self.tensor_keys.action),
             self._reward_key,
             *_as_list(self.tensor_keys.sample_log_prob),
-            *mask_keys,
-            *self._latent_keys,
+            *further,
+            *self._squashed_keys,
         ]
 
     @property
@@ -352,6 +364,12 @@ class TrajectoryGroupLoss(PolicyLoss):
     def _latent_keys(self) -> list[NestedKey]:
         """Where what was drawn before a squashing may be recorded."""
         return [latent_key(k) for k in _as_list(self.tensor_keys.action) if self._may_squash]
+
+    @property
+    def _squashed_keys(self) -> list[NestedKey]:
+        """Those, and where the parameters may be recorded of the distribution it was drawn from."""
+        of_heads = [key for head in self._heads for key in head.in_keys if self._may_squash]
+        return [*self._latent_keys, *of_heads]
 
     def make_value_estimator(self, *args: Any, **hyperparams: Any) -> Any:
         """Refused: there are no values to estimate."""
@@ -400,20 +418,26 @@ class TrajectoryGroupLoss(PolicyLoss):
     def _read_steps(self, tensordict: TensorDictBase) -> Steps:
         if self._reads_completions:
             return self._read_completions(tensordict)
+        if -1 in tensordict.batch_size:
+            raise ValueError(
+                f"The rows of the batch {tuple(tensordict.batch_size)} are of unequal length: "
+                "torchrl_ecpo.groups.pack_groups(...) pads them."
+            )
         reward = get_entry(tensordict, self._reward_key)
         shape = _batch_shape(reward, self._reward_key)
         mask = self._mask(tensordict, shape)
         if values_can_be_seen():
             every = torch.ones(shape, dtype=torch.bool, device=reward.device)
             if self._lacks_time(tensordict, every if mask is None else mask):
-                steps = tensordict.copy()
+                steps = tensordict.select(*self._all_in_keys, strict=False).copy()
                 steps.batch_size = shape
                 return self._read_steps(steps.unsqueeze(-1))
             if mask is not None:
                 check_padding(self.mask_keys, mask)
                 self._check_left(self.mask_keys, mask)
             self._check_single_steps(tensordict)
-        check_group_size(shape[-2], f"K of the batch [*G, K, T] = {tuple(shape)}")
+        if self.least_group > 1:
+            check_group_size(shape[-2], f"K of the batch [*G, K, T] = {tuple(shape)}")
 
         def real(values: Tensor) -> Tensor:
             # A sum over a completion of 1,000 tokens would be off by nats in half precision, and
@@ -445,11 +469,11 @@ class TrajectoryGroupLoss(PolicyLoss):
 
     def _check_single_steps(self, tensordict: TensorDictBase) -> None:
         """Refuse rewards that multi-step transforms have summed: a return sums them again."""
-        steps = tensordict.get("steps_to_next_obs", None)
+        steps = tensordict.get(SPAN_KEY, None)
         if steps is not None and (steps > 1).any():
             raise ValueError(
                 f"The rewards {self._reward_key!r} are sums over up to {int(steps.max())} steps "
-                "('steps_to_next_obs'), and a return would count each reward several times. Leave "
+                f"({SPAN_KEY!r}), and a return would count each reward several times. Leave "
                 "MultiStep and MultiStepTransform out: a group is compared by whole trajectories."
             )
 
@@ -466,10 +490,10 @@ class TrajectoryGroupLoss(PolicyLoss):
         for key in action_keys:
             get_entry(tensordict, key)
         keys = [*self.actor_network.in_keys, *self.further_in_keys]
-        keys += [*action_keys, *self._latent_keys]
-        if self._may_squash:
-            keys += [key for head in self._heads for key in head.in_keys]
+        keys += [*action_keys, *self._squashed_keys]
         inputs = tensordict.select(*keys, strict=False)
+        if isinstance(inputs, LazyStackedTensorDict):  # its members may have a smaller batch size
+            inputs = inputs.contiguous()
         inputs = inputs.copy()  # entries that are tensordicts would get the batch size below
         try:
             inputs.batch_size = shape
@@ -609,6 +633,10 @@ class TrajectoryGroupLoss(PolicyLoss):
         if isinstance(done, Tensor) and done.numel() == real.numel():
             done = done.reshape(real.shape).bool()
             faults[f"go on after an end ({DONE_KEY!r})"] = done[..., :-1] & real[..., 1:]
+        if isinstance(group, Tensor):
+            of_row = real.shape[: group.ndim]
+            if group.shape == of_row:  # of each group or trajectory
+                group = group.reshape(*of_row, *[1] * (real.ndim - group.ndim)).expand_as(real)
         if isinstance(group, Tensor) and group.numel() == real.numel():
             check_real(GROUP_KEY, group)
             group = group.reshape(real.shape)
@@ -628,12 +656,12 @@ class TrajectoryGroupLoss(PolicyLoss):
 
     def _check_left(self, name: Any, mask: Tensor) -> None:
         """Refuse groups of which a mask leaves too little."""
-        is_small = mask.any(-1).sum(-1) < 2
+        is_small = mask.any(-1).sum(-1) < self.least_group
         if is_small.any():
+            few = "fewer than two trajectories" if self.least_group > 1 else "no trajectories"
             raise ValueError(
-                f"The mask ({name}) leaves {int(is_small.sum())} group(s) "
-                "with fewer than two trajectories that have a real step: weights are relative to "
-                "the other trajectories of the group. Drop such groups before calling the loss."
+                f"The mask ({name}) leaves {int(is_small.sum())} group(s) with "
+                f"{few} that have a real step. Drop such groups before calling the loss."
             )
 
 
@@ -705,16 +733,33 @@ def _log_prob_of_part(distribution: Any, inputs: TensorDictBase, key: NestedKey)
     check_real(key, action)
     if isinstance(distribution, Categorical) and action.shape == distribution.batch_shape:
         check_integers(key, action)
+    if isinstance(distribution, Distribution):
+        _check_shape(distribution, key, action)
     if not split(distribution)[1]:
         return distribution.log_prob(action)
     recorded = inputs.get(latent_key(key), None)
     return log_prob_of_latent(distribution, latent_of(distribution, action, recorded))
 
 
+def _check_shape(distribution: Distribution, key: NestedKey, action: Tensor) -> None:
+    """Refuse an action of vectors of another shape, which might broadcast."""
+    event = distribution.event_shape
+    if isinstance(distribution, ONE_HOT):  # TorchRL's have no event_shape
+        event = distribution.param_shape[-1:]
+        if action.shape[:-1] == distribution.batch_shape and action.shape[-1] > event[0]:
+            event = action.shape[-1:]  # of those whose mask are indices, which leave fewer
+    if event and action.shape != distribution.batch_shape + event:
+        raise ValueError(
+            f"The action {key!r} must have the shape {tuple(distribution.batch_shape + event)} of "
+            f"what a {type(distribution).__name__} of the actor draws, got {tuple(action.shape)}."
+        )
+
+
 def _steps_of(module: Any) -> Iterator[Any]:
     """The modules that a policy calls one after the other."""
     if isinstance(module, TensorDictSequential):
-        for each in module.module:
+        steps = module.module  # a ModuleDict, where they have names
+        for each in steps.values() if isinstance(steps, nn.ModuleDict) else steps:
             yield from _steps_of(each)
     else:
         yield module

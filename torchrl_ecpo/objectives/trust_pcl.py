@@ -89,6 +89,7 @@ class TrustPCLLoss(LiftProjectLoss):
     losses = ("loss_value",)
     metrics = ("state_value",)
     reads_steps = True
+    least_group = 1
 
     @dataclass
     class _AcceptedKeys(LiftProjectLoss._AcceptedKeys):
