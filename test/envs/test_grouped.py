@@ -388,11 +388,17 @@ class Careless(gymnasium.Env):
         return numpy.random.rand(1), {}
 
 
-@pytest.mark.parametrize("make", [lambda: GymWrapper(Careless()), Careless])
-def test_copies_that_start_differently_are_refused(make):
+@pytest.mark.parametrize(
+    ("make", "advice"),
+    [(lambda: GymWrapper(Careless()), r", or from torch's\.$"), (Careless, r"\.$")],
+)
+def test_copies_that_start_differently_are_refused(make, advice):
     env = make_grouped_env(make, num_groups=1, group_size=2)
-    with pytest.raises(RuntimeError, match=r"differ in 'observation' at their start.*np_random"):
+    match = rf"differ in 'observation' at their start.*self\.np_random{advice}"
+    with pytest.raises(RuntimeError, match=match):
         env.reset()
+    with pytest.raises(TypeError, match=r"seeded by set_seed\(\.\.\.\).*got seed=3"):
+        env.reset(seed=3)
     env.close()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from functools import partial
 
@@ -178,6 +179,84 @@ def test_a_reward_may_be_an_array_of_one_number():
         assert reward.flatten().tolist() == [12.0] * 3 + [13.0] * 3
 
 
+RIGHT = {"x": np.zeros(2, np.float32)}
+
+
+class Spoilt(gymnasium.Env):
+    """Returns what it is told to, which gymnasium does not allow."""
+
+    observation_space = spaces.Dict(x=spaces.Box(-1, 1, (2,)))
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, reset=(RIGHT, {}), step=(RIGHT, 0.0, False, False, {}), **own):
+        self.out = reset, step
+        vars(self).update(own)
+
+    def reset(self, *, seed=None, options=None):
+        return self.out[0]
+
+    def step(self, action):
+        return self.out[1]
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "match"),
+    [
+        ({"observation_space": None}, "must have an observation_space .*got None"),
+        ({"reset": RIGHT}, r"reset must return \(observation, info\), got {'x'"),
+        ({"reset": ({"x": np.zeros(3)}, {})}, r"must be of Dict.*\(2,\).*got {'x': array\(\[0"),
+        ({"reset": ({"y": np.zeros(2)}, {})}, "must be of Dict.*got {'y'"),
+        ({"step": (RIGHT, 0.0, False, {})}, "step must return .*got a tuple of 4"),
+        ({"step": (RIGHT, np.zeros(2), False, False, {})}, "must be one number, got array"),
+        ({"step": (RIGHT, None, False, False, {})}, "must be one number, got None"),
+    ],
+    ids=str,
+)
+def test_a_copy_that_breaks_the_rules_is_named(spoilt, match):
+    with pytest.raises(ValueError, match=f"Spoilt breaks .*{match}.*env_checker.check_env"):
+        make_grouped_env(partial(Spoilt, **spoilt), **SIZES).rollout(2)
+    make_grouped_env(Spoilt, **SIZES).rollout(2)
+
+
+def test_each_copy_is_given_options_of_its_own():
+    class Taking(Countdown):
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return options["levels"].pop(), {}
+
+    start = make_grouped_env(Taking, **SIZES).reset(options={"levels": [1, 2]})
+    assert (start["observation"] == 2).all()
+
+
+@pytest.mark.parametrize("wrap", [lambda task: task, GymWrapper])
+def test_a_copy_that_is_made_before_is_refused(wrap):
+    task = wrap(Countdown())
+    for make in (lambda: task, lambda: gymnasium.wrappers.TimeLimit(task, 2)):
+        if isinstance(task, GymWrapper):
+            make = lambda: TransformedEnv(task, StepCounter())  # noqa: E731
+        with pytest.raises(ValueError, match=r"must make a new copy at each call.*lambda: MyTask"):
+            make_grouped_env(make, **SIZES).reset()
+
+
+@pytest.mark.usefixtures("forked_workers")
+@pytest.mark.parametrize("when", ["reset", "step"])
+def test_the_death_of_a_process_is_told(when):
+    class Dying(Countdown):
+        def reset(self, **options):
+            out = super().reset(**options)
+            return os._exit(3) if when == "reset" else out
+
+        def step(self, action):
+            return os._exit(3) if action == 2 else super().step(action)
+
+    env = make_grouped_env(Dying, num_groups=1, group_size=2, parallel=True)
+    dead = "[01]" if when == "reset" else "1"
+    with pytest.raises(ChildProcessError, match=rf"died in a {when} .*{dead}: 3.*make it again"):
+        env.step(env.reset().set("action", torch.tensor([[0, 2]])))
+    assert not any(process.is_alive() for process in env._vector.processes)
+    env.close()
+
+
 def test_no_step_is_played_for_nothing():
     """Over a batch, copies are stepped as often as it has steps."""
     count = 0
@@ -232,7 +311,7 @@ class Arranged(gymnasium.Env):
 
     def __init__(self, observation, action=None):
         self.observation_space = observation
-        self.action_space = action or spaces.Discrete(2)
+        self.action_space = spaces.Discrete(2) if action is None else action
 
     def reset(self, *, seed=None, options=None):
         self.observation_space.seed(seed)
@@ -305,6 +384,9 @@ def test_actions_of_several_kinds():
     assert env.step(start)["next", "reward"].flatten().tolist() == [2 + 0.75 + 2, 2 - 0.75 + 1]
 
 
+NUMBER = spaces.Box(-1, 1, (1,))
+
+
 @pytest.mark.parametrize(
     ("space", "match"),
     [
@@ -318,6 +400,11 @@ def test_actions_of_several_kinds():
         (spaces.Discrete(3, start=1), "counted from 0.*got Discrete.*TransformObservation"),
         (spaces.Box(0, 9, (2,), np.uint16), "TorchRL does not read.*TransformObservation"),
         (spaces.Dict(done=spaces.Discrete(2)), r"entries \['done'\], .* itself.*FilterObservation"),
+        *(
+            (spaces.Dict({name: NUMBER}), rf"entries \['{name}'\], .* itself.*FilterObservation")
+            for name in ("next", "_step", "_reset", "is_init", "collector")
+        ),
+        (spaces.Dict({0: NUMBER}), r"strings as names, got \[0\].*FilterObservation"),
     ],
     ids=str,
 )
@@ -326,10 +413,18 @@ def test_a_space_that_is_not_read_is_refused(space, match):
         make_grouped_env(partial(Arranged, space), **SIZES)
 
 
-def test_actions_that_are_not_played_are_refused():
-    space = spaces.Dict(hand=spaces.Text(2))
-    with pytest.raises(TypeError, match=r"action\['hand'\].*got Text.*wrappers\.TransformAction"):
-        make_grouped_env(partial(Arranged, spaces.Discrete(2), space), **SIZES)
+@pytest.mark.parametrize(
+    ("space", "match"),
+    [
+        (spaces.Dict(hand=spaces.Text(2)), r"action\['hand'\].*got Text.*TransformAction"),
+        (spaces.MultiDiscrete([[2, 3], [4, 5]]), r"(?s)got MultiDiscrete.*TransformAction"),
+        (spaces.Dict(seen=NUMBER), r"\['seen'\], which the observation .*TransformAction"),
+    ],
+    ids=str,
+)
+def test_actions_that_are_not_played_are_refused(space, match):
+    with pytest.raises((TypeError, ValueError), match=match):
+        make_grouped_env(partial(Arranged, spaces.Dict(seen=NUMBER), space), **SIZES)
 
 
 @pytest.mark.parametrize("make", ["CartPole-v1", Countdown], ids=str)

@@ -101,6 +101,16 @@ def check_owner(state: Mapping[str, Any], own: str) -> None:
         raise ValueError(f"The state is of another environment: of {owner}, and this is {own}.")
 
 
+def check_is_new(name: str, task: Any, others: list[Any]) -> None:
+    """Refuse a copy that is one of the others, and note it."""
+    if any(task is other for other in others):
+        raise ValueError(
+            f"{name} must make a new copy at each call, and it returns {task!r:.100} again. Make "
+            "the environment in the function: lambda: MyTask(...)."
+        )
+    others.append(task)
+
+
 class OneInstance(EnvBase):
     """Rows of copies `[G, K]` that all play one problem instance, in which nothing is random.
 
@@ -140,6 +150,8 @@ class SeededGroups(EnvBase):
 
     Who extends this sets the specs, calls :meth:`_begin`, and writes :meth:`_start` and ``_step``.
     """
+
+    _seeded_generators = "gymnasium's self.np_random"
 
     def _begin(self) -> None:
         """Add the group to the specs, and draw a seed."""
@@ -188,6 +200,11 @@ class SeededGroups(EnvBase):
         return seeds, ids
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        if "seed" in kwargs:
+            raise TypeError(
+                "Groups are seeded by set_seed(...), from which the seeds of their episodes come; "
+                f"reset takes none, got seed={kwargs['seed']!r}."
+            )
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             tensordict = None
@@ -214,7 +231,7 @@ class SeededGroups(EnvBase):
                 raise RuntimeError(
                     f"The copies of a group differ in {key!r} at their start, though they are "
                     "reset with one seed. The environment has to draw its start from a generator "
-                    "that its reset seeds, gymnasium's self.np_random, or from torch's."
+                    f"that its reset seeds, {self._seeded_generators}."
                 )
 
     def get_extra_state(self) -> dict[str, Any]:

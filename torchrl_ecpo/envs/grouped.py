@@ -9,10 +9,10 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torchrl.data.utils import CloudpickleWrapper
-from torchrl.envs import EnvBase, GymWrapper, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs import EnvBase, GymLikeEnv, GymWrapper, ParallelEnv, SerialEnv, TransformedEnv
 
 from torchrl_ecpo.checks import check_count, check_flag, check_group_size, check_real, get_entry
-from torchrl_ecpo.envs._groups import SeededGroups
+from torchrl_ecpo.envs._groups import SeededGroups, check_is_new
 
 
 class GroupedEnv(SeededGroups):
@@ -49,7 +49,8 @@ class GroupedEnv(SeededGroups):
     Raises:
         TypeError: if `create_env_fn` is no function, or makes no environment of TorchRL.
         ValueError: if `group_size` is below 2, `num_groups` below 1, or a copy has a batch size;
-            for a negative seed, and for the state of another environment.
+            if `create_env_fn` returns one copy again and again; for a negative seed, and for the
+            state of another environment.
         RuntimeError: at a reset of everything, if the copies of a row do not start alike.
 
     Examples:
@@ -66,6 +67,7 @@ class GroupedEnv(SeededGroups):
     """
 
     copies: EnvBase
+    _seeded_generators = "gymnasium's self.np_random, or from torch's"
 
     def __init__(
         self,
@@ -83,9 +85,11 @@ class GroupedEnv(SeededGroups):
                 "create_env_fn must be a function that makes a copy, such as "
                 f'lambda: GymEnv("CartPole-v1"), got {create_env_fn!r}.'
             )
-        batched = ParallelEnv if check_flag("parallel", parallel) else SerialEnv
+        parallel = check_flag("parallel", parallel)
+        batched = ParallelEnv if parallel else SerialEnv
         copies = batched(
-            num_groups * group_size, CloudpickleWrapper(partial(_make_copy, create_env_fn))
+            num_groups * group_size,
+            CloudpickleWrapper(partial(_make_copy, create_env_fn, None if parallel else [])),
         )
         if copies.batch_size != (num_groups * group_size,):
             shape = tuple(copies.batch_size[1:])
@@ -134,14 +138,26 @@ class GroupedEnv(SeededGroups):
             self.copies.close(raise_if_closed=raise_if_closed)
 
 
-def _make_copy(create_env_fn: Callable[[], EnvBase]) -> EnvBase:
+def _make_copy(create_env_fn: Callable[[], EnvBase], others: list[Any] | None) -> EnvBase:
+    """Make one, of another task than the others, which are None in a process of its own."""
     env = create_env_fn()
     if not isinstance(env, EnvBase):
         raise TypeError(
             "create_env_fn must make an environment of TorchRL (of gymnasium's: GymWrapper), got "
             f"{env!r}."
         )
+    if others is not None:
+        task: Any = _without_transforms(env)
+        if isinstance(task, GymLikeEnv):
+            task = getattr(task._env, "unwrapped", task._env)
+        check_is_new("create_env_fn", task, others)
     return _SeededEnv(env, auto_unwrap=False)
+
+
+def _without_transforms(env: Any) -> EnvBase:
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env
 
 
 class _SeededEnv(TransformedEnv):
@@ -152,9 +168,7 @@ class _SeededEnv(TransformedEnv):
     ) -> TensorDictBase:
         if seed is None:
             return super()._reset(tensordict, **kwargs)
-        native = self.base_env
-        while isinstance(native, TransformedEnv):
-            native = native.base_env
+        native = _without_transforms(self.base_env)
         cuda = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
         with torch.random.fork_rng(devices=cuda):
             torch.manual_seed(seed)

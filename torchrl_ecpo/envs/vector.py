@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from copy import deepcopy
 from functools import partial
+from multiprocessing.connection import wait
 from typing import Any
 
 import gymnasium as gym
@@ -26,7 +28,7 @@ from torchrl_ecpo.checks import (
     check_real,
     get_entry,
 )
-from torchrl_ecpo.envs._groups import SeededGroups
+from torchrl_ecpo.envs._groups import SeededGroups, check_is_new
 from torchrl_ecpo.envs.grouped import GroupedEnv
 from torchrl_ecpo.groups import GROUP_KEY
 
@@ -51,7 +53,8 @@ def make_grouped_env(
 
     Raises:
         TypeError: if `env` is or makes anything else.
-        ValueError: for an id that gymnasium does not know, and what the two classes refuse.
+        ValueError: for an id that gymnasium does not know, for a function that returns one copy
+            again and again, and what the two classes refuse.
 
     Examples:
         >>> env = make_grouped_env("Acrobot-v1", num_groups=2, group_size=3)
@@ -80,10 +83,12 @@ class VectorGroupedEnv(SeededGroups):
     """:class:`GroupedEnv` over gymnasium's own vector environments, several times as fast.
 
     Seeds, starts, group ids and the state that is saved are those of ``GroupedEnv`` over
-    ``GymEnv(..., categorical_action_encoding=True)``, and so are the entries: observations in the
-    dtype of their space, those of a ``Dict`` by their names, those of a ``Tuple`` as
-    ``("observation", "0")`` and so on; what is discrete as integers, ``Box`` without dimensions as
-    one number. Rewards are float32.
+    ``GymEnv(..., categorical_action_encoding=True)``, for tasks that draw from gymnasium's
+    ``np_random``; torch's generator is not seeded here, so that one which draws its start from that
+    is for ``GroupedEnv``. The entries are the same too: observations in the dtype of their space,
+    those of a ``Dict`` by their names, those of a ``Tuple`` as ``("observation", "0")`` and so on;
+    a drawing, which is a ``Box`` of bytes ``(H, W, 3)``, as ``"pixels"``; what is discrete as
+    integers, ``Box`` without dimensions as one number. Rewards are float32.
 
     The copies are played in a ``SyncVectorEnv``, or with `parallel` in an ``AsyncVectorEnv``, by
     ``AutoresetMode.DISABLED`` and reset masks. A copy that is over, or that ``"_step"`` leaves out,
@@ -105,7 +110,10 @@ class VectorGroupedEnv(SeededGroups):
         TypeError: if `env` makes anything else, and for a space that is not read (``Text``,
             ``Graph``, ``Sequence``), with the wrapper that mends it.
         ValueError: for an id that gymnasium does not know, and for numbers as in ``GroupedEnv``.
+            Also for a function that returns one copy again and again, and for a copy that breaks
+            its spaces or gymnasium's rules.
         RuntimeError: at a reset of everything, if the copies of a row do not start alike.
+        ChildProcessError: if the process of a copy dies; all are ended then.
 
     Examples:
         >>> env = VectorGroupedEnv("CartPole-v1", num_groups=2, group_size=3)
@@ -137,8 +145,16 @@ class VectorGroupedEnv(SeededGroups):
             ) from error
         check_kind("What env makes", one, gym.Env)
         one.close()
+        for name in ("observation_space", "action_space"):
+            if not isinstance(space := getattr(one, name, None), gym.Space):
+                raise _broken(one, f"it must have an {name} of gymnasium.spaces, got {space!r}")
         shown = _read_root("observation", one.observation_space)
         action = _read_root("action", one.action_space)
+        if shared := {*shown.keys()}.intersection(action.keys()):
+            raise ValueError(
+                f"The action space has entries {sorted(shared)}, which the observation space has "
+                f"too, so that one would be written over the other. {_MENDS['action']}."
+            )
         super().__init__(batch_size=rows)
         self._shown = shown.expand(rows)
         self.observation_spec = self._shown.clone()
@@ -157,6 +173,9 @@ class VectorGroupedEnv(SeededGroups):
             batched = AsyncVectorEnv if parallel else SyncVectorEnv
             copies = [lambda: _Copy(make())] * rows.numel()
             self._vector = batched(copies, autoreset_mode=AutoresetMode.DISABLED)
+            others: list[Any] = []
+            for copy in () if parallel else self._vector.envs:
+                check_is_new("env", copy.unwrapped, others)
         self._ends = np.zeros((2, rows.numel()), dtype=bool)  # terminated, truncated
         self._begin()
 
@@ -169,7 +188,7 @@ class VectorGroupedEnv(SeededGroups):
         mask = np.array([seed is not None for seed in seeds])
         if mask.any():
             options = {**(options or {}), "reset_mask": mask}
-            self._seen, _ = self._vector.reset(seed=seeds, options=options)
+            self._seen, _ = self._call("reset", seed=seeds, options=options)
             self._ends[:, mask] = False
         return self._output()
 
@@ -186,7 +205,7 @@ class VectorGroupedEnv(SeededGroups):
         else:
             each = zip(iterate(self._actions, actions), live.tolist(), strict=True)
             actions = [action if goes else None for action, goes in each]
-        self._seen, reward, _, _, info = self._vector.step(actions)
+        self._seen, reward, _, _, info = self._call("step", actions)
         if "terminated" in info:
             self._ends |= [info["terminated"], info["truncated"]]
         reward = torch.from_numpy(np.multiply(reward, live, dtype=np.float32))
@@ -195,6 +214,29 @@ class VectorGroupedEnv(SeededGroups):
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         """What a step returns is complete, so that there is nothing to add."""
         return next_tensordict_out
+
+    def _call(self, method: str, *args: Any, **kwargs: Any) -> Any:
+        """Call the vector environment, of which a process may have died."""
+        try:
+            return getattr(self._vector, method)(*args, **kwargs)
+        except (EOFError, ConnectionError) as error:
+            pipes = getattr(self._vector, "parent_pipes", [None])
+            if None in pipes:  # a copy has raised it
+                raise
+            processes = self._vector.processes
+            wait([process.sentinel for process in processes], timeout=1)
+            ended = {
+                i: code for i, one in enumerate(processes) if (code := one.exitcode) is not None
+            }
+            for pipe, process in zip(pipes, processes, strict=True):
+                pipe.close()
+                process.kill()
+                process.join()
+            self._vector.closed = True
+            raise ChildProcessError(
+                f"Processes of copies have died in a {method} (exit codes by copy: {ended}). The "
+                "environment is closed: make it again, and see to it that no copy ends its process."
+            ) from error
 
     def _output(self, **others: Any) -> TensorDictBase:
         """What a step or a reset returns; the arrays are not written to again."""
@@ -228,19 +270,65 @@ class _Copy(gym.Wrapper):
         self.action_space = spaces.Discrete(1)  # of which a batch may be any list
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        if not kwargs.get("options"):  # gymnasium's vector environment makes an empty mapping
-            kwargs.pop("options", None)
-        self._seen, _ = self.env.reset(**kwargs)
+        options = kwargs.pop("options", None)
+        if options:  # gymnasium's vector environment makes an empty mapping
+            kwargs["options"] = deepcopy(options)  # the others are given them too
+        out: Any = self.env.reset(**kwargs)
+        if not isinstance(out, tuple) or len(out) != 2:
+            raise _broken(self, f"reset must return (observation, info), got {_told(out)}")
+        self._seen = self._check_seen(out[0])
         return self._seen, {}
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         if action is None:
             return self._seen, 0.0, False, False, {}
-        self._seen, reward, terminated, truncated, _ = self.env.step(action)
-        reward = np.asarray(reward).item()  # of an array of one number, too
+        out: Any = self.env.step(action)
+        if not isinstance(out, tuple) or len(out) != 5:
+            wanted = "(observation, reward, terminated, truncated, info)"
+            raise _broken(self, f"step must return {wanted}, got {_told(out)}")
+        seen, reward, terminated, truncated, _ = out
+        self._seen = self._check_seen(seen)
+        number = np.asarray(reward)  # an array of one number, too
+        if number.size != 1 or number.dtype.kind not in "biuf":
+            raise _broken(self, f"the reward of a step must be one number, got {reward!r}")
+        reward = number.item()
         is_over = terminated or truncated
         ends = {"terminated": bool(terminated), "truncated": bool(truncated)} if is_over else {}
         return self._seen, reward, False, False, ends
+
+    def _check_seen(self, seen: Any) -> Any:
+        if not _has_shape(self.observation_space, seen):
+            raise _broken(
+                self, f"an observation must be of {self.observation_space}, got {seen!r:.200}"
+            )
+        return seen
+
+
+def _has_shape(space: Any, value: Any) -> bool:
+    """Whether a value is laid out as a space says; its numbers are not looked at."""
+    if parts := _parts(space):
+        kind = Mapping if isinstance(space, spaces.Dict) else (tuple, list)
+        if not isinstance(value, kind) or len(value) < len(parts):
+            return False
+        there = range(len(value)) if isinstance(value, (tuple, list)) else value
+        return all(key in there and _has_shape(part, value[key]) for key, _, part in parts)
+    return np.shape(value) == space.shape
+
+
+def _told(out: Any) -> str:
+    return f"a tuple of {len(out)}" if isinstance(out, tuple) else f"{out!r:.200}"
+
+
+def _broken(env: gym.Env, what: str) -> ValueError:
+    """A copy does not do what gymnasium asks of it."""
+    try:
+        name = type(env.unwrapped).__name__
+    except AttributeError:
+        name = type(env).__name__
+    return ValueError(
+        f"{name} breaks gymnasium's rules: {what}. gymnasium.utils.env_checker.check_env(env) "
+        "finds out more."
+    )
 
 
 def _is_plain_cartpole(spec: Any) -> bool:
@@ -317,21 +405,29 @@ def _read_root(root: str, space: gym.Space) -> Composite:
         is_picture = is_box and GymWrapper(_Spaces(space)).from_pixels
         return Composite({"pixels" if is_picture else root: spec})
     own = {"reward", "done", "terminated", "truncated", GROUP_KEY}
+    own |= {"next", "_step", "_reset", "is_init", "collector"}
     if taken := (own | ({"action"} - {root})).intersection(spec.keys()):
         raise ValueError(
-            f"The {root} space has entries {sorted(taken)}, which an environment of TorchRL has "
-            f"itself. {_MENDS[root]}."
+            f"The {root} space has entries {sorted(taken)}, which an environment of TorchRL, or "
+            f"what is around it, has itself. {_MENDS[root]}."
         )
     return spec
 
 
 def _read_space(root: str, name: str, space: gym.Space) -> Any:
     if parts := _parts(space):
+        if strange := [own for _, own, _ in parts if not isinstance(own, str)]:
+            raise TypeError(
+                f"The entries of the space of {name} must have strings as names, got {strange}. "
+                f"{_MENDS[root]}."
+            )
         return Composite(
             {own: _read_space(root, f"{name}[{key!r}]", part) for key, own, part in parts}
         )
     kinds = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
-    if isinstance(space, kinds) and not np.any(getattr(space, "start", 0)):
+    sizes = getattr(space, "nvec", np.zeros(1))
+    is_ragged = sizes.ndim > 1 and bool((sizes != sizes[:1]).any())  # as no spec of TorchRL's is
+    if isinstance(space, kinds) and not np.any(getattr(space, "start", 0)) and not is_ragged:
         try:
             return GymWrapper(_Spaces(space), categorical_action_encoding=True).action_spec
         except (KeyError, TypeError, RuntimeError):  # TorchRL has no spec of the dtype or the shape
