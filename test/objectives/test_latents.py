@@ -21,6 +21,7 @@ from torch.distributions import (
     ComposeTransform,
     Independent,
     Normal,
+    StickBreakingTransform,
     TanhTransform,
     TransformedDistribution,
 )
@@ -31,6 +32,7 @@ from trajectory_problems import as_keywords
 
 from torchrl_ecpo import ECPOLoss, MENTLoss, PMDLoss
 from torchrl_ecpo.modules import record_latents
+from torchrl_ecpo.modules.latents import latent_of
 
 G, K, T, A = 2, 4, 20, 2
 
@@ -122,6 +124,30 @@ def test_another_action_than_was_drawn_is_evaluated_itself(name):
     other["action"][0, 0, 0] = torch.nan
     with pytest.raises(ValueError, match="NaN"):
         PMDLoss(actor)(other)
+
+
+@pytest.mark.parametrize("recorded", ["latents", "parameters"])
+def test_an_action_on_a_simplex_has_a_number_more_than_its_latent(recorded):
+    actor = make_actor(_of_torch(StickBreakingTransform()), 0.0, 0.0)
+    record_latents(actor)
+    batch = draw(actor)
+    assert batch["action"].shape == (G, K, T, A + 1)
+    batch = batch.exclude("action_latent" if recorded == "parameters" else "loc")
+    out = ECPOLoss(actor)(batch)
+    out["loss_actor"].backward()
+    assert out["kl_reference_policy"].item() == pytest.approx(0, abs=1e-4)
+    if recorded == "latents":  # and another action is evaluated itself
+        batch["action"] = batch["action"].flip(2)
+        expected = PMDLoss(actor)(batch.exclude("action_latent"))
+        assert_close(PMDLoss(actor)(batch), expected)
+
+
+def test_parts_of_an_action_are_compared_each_by_its_own_size():
+    high, latent = torch.tensor([1e6, 1.0]), torch.tensor([[1.0, 0.0]])
+    drawn = TanhNormal(torch.zeros(1, 2), torch.ones(1, 2), low=-high, high=high)
+    action = high * latent.tanh() + torch.tensor([0.0, 0.5])  # noise is added to the second
+    found = latent_of(drawn, action, latent)
+    assert_close(found, torch.tensor([[1.0, 0.5]]).where(latent == 1, torch.tensor(0.5).atanh()))
 
 
 @pytest.mark.parametrize(("loc", "log_scale"), [(0.0, 0.0), (8.0, 0.0), (0.0, 2.0)])

@@ -130,8 +130,7 @@ def split(distribution: Any) -> tuple[Distribution, list[Any]]:
 def invert(distribution: Distribution, action: Tensor) -> Tensor:
     """A latent of an action: one of many if it is rounded to the end of its range, NaN outside."""
     for transform in reversed(list(_each(split(distribution)[1]))):
-        is_tanh = isinstance(transform, TanhTransform)
-        if is_tanh:
+        if isinstance(transform, TanhTransform):
             eps = torch.finfo(action.dtype).eps
             inside = action.clamp(-1 + eps, 1 - eps)
             action = inside.where(action.abs() <= 1 + 8 * eps, torch.nan)
@@ -153,7 +152,10 @@ def latent_of(distribution: Distribution, action: Tensor, recorded: Tensor | Non
     if made.shape != action.shape:
         return recorded
     eps = max(torch.finfo(x.dtype).eps for x in (action, recorded))
-    is_same = (made - action).abs() <= 64 * eps * action.abs().amax()
+    scale = action.abs().amax(tuple(range(action.ndim - 1)))  # of each number of the action
+    is_same = (made - action).abs() <= 64 * eps * scale
+    if recorded.shape != action.shape:  # as on a simplex, which has a number more
+        is_same = is_same.all(-1, keepdim=True)
     return recorded.where(is_same, latent.to(recorded.dtype))
 
 
@@ -194,5 +196,8 @@ def is_lost(distribution: Distribution, action: Tensor, parameters: Iterable[Ten
     for transform in _each(split(distribution)[1]):
         before, latent = latent, transform(latent)
         log_slope = log_slope + transform.log_abs_det_jacobian(before, latent).reshape(shape)
-        error = error + eps * latent.abs().reshape(shape) / log_slope.exp()
+        size, slope = latent.abs().reshape(shape), log_slope.exp()
+        if size.shape != slope.shape:  # as on a simplex: by its largest and least
+            size, slope = size.amax(-1, keepdim=True), slope.amin(-1, keepdim=True)
+        error = error + eps * size / slope
     return torch.as_tensor(error > LOST).any(-1)
