@@ -240,6 +240,30 @@ def test_what_a_step_lacks_is_named() -> None:
         network(sequences()[:, 1:])
 
 
+@pytest.mark.parametrize(
+    ("classes", "match"),
+    [
+        (torch.tensor([[3, 0]]), r"integers from -1 to \[2, 1\], got values from \[3, 0\]"),
+        (torch.tensor([[0, -2]]), r"integers from -1 to \[2, 1\], got values from \[0, -2\]"),
+        (torch.zeros(4, 3, dtype=torch.int64), r"of 2 integers in a row.*int64 \(4, 3\)"),
+        (torch.zeros(2, dtype=torch.int64), r"of 2 integers in a row.*int64 \(2,\)"),
+        (torch.zeros(4, 2), "'classes' must hold integers, got torch.float32"),
+    ],
+    ids=str,
+)
+def test_what_is_no_class_is_refused(classes: torch.Tensor, match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        OneHotLinear(NUM_CLASSES, 5)(classes)
+    assert OneHotLinear(NUM_CLASSES, 5)(torch.tensor([[-1, 1], [2, -1]])).shape == (2, 5)
+
+
+def test_inputs_that_are_no_integers_are_named() -> None:
+    network = DistinctWindowNetwork((3, 2), OneHotLinear((3, 2), 5), in_keys=["place", "kind"])
+    given = TensorDict(place=torch.tensor([1]), kind=torch.tensor([0.0]), batch_size=[1])
+    with pytest.raises(ValueError, match=r"entry 'kind' must hold integers, got torch\.float32"):
+        network(given)
+
+
 def test_tables_add_their_rows_where_no_blank_is_seen() -> None:
     torch.manual_seed(0)
     blank, moves, characters = 3, 4, 3

@@ -22,6 +22,7 @@ from torchrl.modules import recurrent_mode
 
 from torchrl_ecpo.checks import (
     check_counts,
+    check_integers,
     check_keys,
     check_mask,
     names_entries,
@@ -145,6 +146,9 @@ class DistinctCore(TensorDictModuleBase):
     def read_symbols(self, tensordict: TensorDictBase) -> Tensor:
         """The input tuple as one number, int64 `[*B]`."""
         inputs = [tensordict.get(key) for key in self.input_keys]
+        for key, entry in zip(self.input_keys, inputs, strict=True):
+            if isinstance(entry, Tensor) and entry.dtype != torch.bool:  # others are told below
+                check_integers(key, entry)
         ndim = tensordict.ndim
         classes = torch.cat([x if x.ndim > ndim else x.unsqueeze(-1) for x in inputs], -1)
         if classes.shape[-1] != len(self.num_classes):

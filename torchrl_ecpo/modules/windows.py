@@ -12,7 +12,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.data import TensorSpec, Unbounded
 
-from torchrl_ecpo.checks import check_count, check_counts, check_kind, described
+from torchrl_ecpo.checks import (
+    check_count,
+    check_counts,
+    check_integers,
+    check_kind,
+    described,
+    values_can_be_seen,
+)
 from torchrl_ecpo.modules.distinct import DistinctCore, Evaluated, radix
 
 STATE_KEY = "window"
@@ -120,7 +127,7 @@ class DistinctWindowNetwork(DistinctCore):
     @property
     def is_tabular(self) -> bool:
         """Whether all windows are evaluated, which costs less than to find those that occur."""
-        return self.base**self.window <= FEW
+        return self.num_windows <= FEW
 
     def _every(self, device: torch.device) -> Tensor:
         return torch.arange(self.num_windows, device=device)
@@ -169,7 +176,8 @@ class OneHotLinear(nn.Linear):
 
     Raises:
         TypeError: if `num_classes` is no sequence.
-        ValueError: for numbers of classes that are no positive integers.
+        ValueError: for numbers of classes that are no positive integers, and for classes that are
+            no integers from -1 on below those numbers.
 
     Examples:
         >>> import torch
@@ -180,15 +188,29 @@ class OneHotLinear(nn.Linear):
     """
 
     offsets: Tensor
+    last: Tensor
 
     def __init__(self, num_classes: Sequence[int], out_features: int) -> None:
         sizes = torch.tensor(check_counts("num_classes", num_classes))
         super().__init__(int(sizes.sum()), out_features)
         self.register_buffer("offsets", sizes.cumsum(0) - sizes, persistent=False)
+        self.register_buffer("last", sizes - 1, persistent=False)
 
     def forward(self, classes: Tensor) -> Tensor:
         """From int64 `[n, *]`, one of each of `num_classes`, to `[n, H]`; -1 is the zero vector."""
+        if classes.ndim < 2 or classes.shape[1:].numel() != len(self.last):
+            raise ValueError(
+                f"classes: expected int64 [n, *] of {len(self.last)} integers in a row, one for "
+                f"each of num_classes, got {described(classes)}."
+            )
+        check_integers("classes", classes)
         classes = classes.flatten(1)
+        lowest = torch.full_like(self.last, -1)
+        if values_can_be_seen() and not torch.equal(classes.clamp(lowest, self.last), classes):
+            raise ValueError(
+                f"classes: expected integers from -1 to {self.last.tolist()}, got values from "
+                f"{classes.amin(0).tolist()} to {classes.amax(0).tolist()}."
+            )
         hot = (classes + self.offsets).where(classes >= 0, self.in_features)
         columns = F.pad(self.weight.t(), (0, 0, 0, 1))  # the last one is of -1
         return F.embedding_bag(hot, columns, mode="sum") + self.bias
