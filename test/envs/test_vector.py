@@ -228,14 +228,20 @@ def test_each_copy_is_given_options_of_its_own():
     assert (start["observation"] == 2).all()
 
 
-@pytest.mark.parametrize("wrap", [lambda task: task, GymWrapper])
-def test_a_copy_that_is_made_before_is_refused(wrap):
-    task = wrap(Countdown())
-    for make in (lambda: task, lambda: gymnasium.wrappers.TimeLimit(task, 2)):
-        if isinstance(task, GymWrapper):
-            make = lambda: TransformedEnv(task, StepCounter())  # noqa: E731
-        with pytest.raises(ValueError, match=r"must make a new copy at each call.*lambda: MyTask"):
-            make_grouped_env(make, **SIZES).reset()
+TASK = Countdown()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: TASK,
+        lambda: gymnasium.wrappers.TimeLimit(TASK, 2),
+        lambda: TransformedEnv(GymWrapper(TASK), StepCounter()),
+    ],
+)
+def test_a_copy_that_was_made_before_is_refused(make):
+    with pytest.raises(ValueError, match=r"must make a new copy at each call.*lambda: MyTask"):
+        make_grouped_env(make, **SIZES).reset()
 
 
 @pytest.mark.usefixtures("forked_workers")

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torchrl.data.utils import CloudpickleWrapper
-from torchrl.envs import EnvBase, GymLikeEnv, GymWrapper, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs import EnvBase, GymWrapper, ParallelEnv, SerialEnv, TransformedEnv
 
 from torchrl_ecpo.checks import check_count, check_flag, check_group_size, check_real, get_entry
 from torchrl_ecpo.envs._groups import SeededGroups, check_is_new
@@ -148,8 +148,7 @@ def _make_copy(create_env_fn: Callable[[], EnvBase], others: list[Any] | None) -
         )
     if others is not None:
         task: Any = _without_transforms(env)
-        if isinstance(task, GymLikeEnv):
-            task = getattr(task._env, "unwrapped", task._env)
+        task = task.unwrapped if isinstance(task, GymWrapper) else task
         check_is_new("create_env_fn", task, others)
     return _SeededEnv(env, auto_unwrap=False)
 
