@@ -29,6 +29,13 @@ loss_module(next(iter(collector)))["loss_actor"].backward()
 """
 
 
+def test_what_a_package_has_not_is_told_without_an_import(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torchrl_ecpo.envs.vector", None)  # importing it fails
+    assert not hasattr(torchrl_ecpo.envs, "nonsense")
+    assert not hasattr(torchrl_ecpo, "nonsense")
+    assert torchrl_ecpo.functional.__name__ == "torchrl_ecpo.functional"
+
+
 @pytest.fixture(scope="module")
 def project():
     return tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

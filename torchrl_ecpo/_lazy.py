@@ -5,11 +5,14 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 
 def importing(package: str, *modules: str) -> Callable[[str], Any]:
     """A package's ``__getattr__``: all its modules are imported with the first name asked for.
+
+    Its other submodules are found too; any other name is none of its own, and imports nothing.
 
     Args:
         package: its name; it has an ``__all__``.
@@ -18,7 +21,10 @@ def importing(package: str, *modules: str) -> Callable[[str], Any]:
 
     def get(name: str) -> Any:
         here = vars(sys.modules[package])
-        if not name.startswith("__"):
+        if name not in here["__all__"]:
+            if find_spec(f"{package}.{name}"):
+                return import_module(f"{package}.{name}")
+        else:
             for module in modules:
                 part = vars(import_module(f"{package}.{module}"))
                 here.update({each: part[each] for each in here["__all__"] if each in part})
