@@ -30,7 +30,9 @@ class SupervisedSyncCollector(PlayerCollector):
     """TorchRL's ``Collector`` in worker processes, all of which play each batch.
 
     As TorchRL's ``MultiSyncCollector``; yet a worker takes new weights between two batches, the
-    death of one is a ``ChildProcessError`` at once, and its errors are raised here.
+    death of one is a ``ChildProcessError`` at once, its errors are raised here, and a batch is flat
+    ``[frames]``, worker by worker, for replay buffers. Value estimators need the time dimension
+    last: ``batch.reshape(num_workers, -1)``, if the environments have no batch size.
 
     Args:
         create_env_fn: a maker of an environment for each worker; they travel by value.
@@ -40,11 +42,11 @@ class SupervisedSyncCollector(PlayerCollector):
         init_random_frames: how many actions are random at first, over all workers. Default: 0.
         postproc: called with each batch, in this process. Default: None.
         replay_buffer: extended by each batch, in place of which None is yielded. Default: None.
-        options: what else ``Collector`` takes.
+        options: what else ``Collector`` takes, but for ``split_trajs=True``.
 
     Raises:
         TypeError: if `create_env_fn` is no sequence of functions, or `policy` no function.
-        ValueError: for numbers of frames that are none.
+        ValueError: for numbers of frames that are none, and for ``split_trajs=True``.
         ChildProcessError: if a worker dies.
 
     Examples:
@@ -72,6 +74,11 @@ class SupervisedSyncCollector(PlayerCollector):
     ) -> None:
         """Start the workers; the class describes the arguments."""
         super().__init__(policy, total_frames, postproc, replay_buffer)
+        if options.get("split_trajs"):
+            raise ValueError(
+                "split_trajs must be left out, for a batch is flat [frames], got "
+                f"{options['split_trajs']!r}. TorchRL's MultiSyncCollector splits trajectories."
+            )
         frames_per_batch = check_count("frames_per_batch", frames_per_batch)
         init_random_frames = check_count("init_random_frames", init_random_frames, least=0)
         check_kind("create_env_fn", create_env_fn, Sequence)
@@ -96,7 +103,8 @@ class SupervisedSyncCollector(PlayerCollector):
 class SupervisedAsyncCollector(SupervisedSyncCollector):
     """The same, but each batch is one worker's, while the others go on.
 
-    As TorchRL's ``MultiAsyncCollector``: a batch may come from weights before the last update.
+    As TorchRL's ``MultiAsyncCollector``: a batch may come from weights before the last update. It
+    is flat ``[frames]`` too, so that of environments without a batch size it is one row of time.
 
     Raises:
         ValueError: as :class:`SupervisedSyncCollector`.
