@@ -130,7 +130,8 @@ def split(distribution: Any) -> tuple[Distribution, list[Any]]:
 def invert(distribution: Distribution, action: Tensor) -> Tensor:
     """A latent of an action: one of many if it is rounded to the end of its range, NaN outside."""
     for transform in reversed(list(_each(split(distribution)[1]))):
-        if isinstance(transform, TanhTransform):
+        is_tanh = isinstance(transform, TanhTransform)
+        if is_tanh:
             eps = torch.finfo(action.dtype).eps
             inside = action.clamp(-1 + eps, 1 - eps)
             action = inside.where(action.abs() <= 1 + 8 * eps, torch.nan)
