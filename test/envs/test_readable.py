@@ -14,6 +14,7 @@ from torchrl_ecpo.envs import EpisodeReplay, readable
 CHOICE = spaces.Discrete(2)
 NUMBERS = spaces.Box(-1, 1, (2,), np.float32)
 IMAGE = spaces.Box(0, 255, (6, 5, 3), np.uint8)
+PLAIN = spaces.Dict(a=spaces.Discrete(3), b=spaces.Box(0, 4, (2,)))
 MIXED = spaces.Dict(a=spaces.Discrete(3, start=2), b=spaces.Box(0, 4, (1, 2), np.float64))
 
 
@@ -183,15 +184,14 @@ def test_a_mission_that_is_always_the_same_is_not_read():
     assert seen.tolist() == env.reset(seed=0)[0]["image"].flatten().tolist()
 
 
-def test_an_episode_of_choices_and_numbers_can_be_played_again():
-    tasks = [Own(actions=MIXED) for _ in range(2)]
+@pytest.mark.parametrize("wrap", [readable, lambda task: task])
+def test_an_episode_of_choices_and_numbers_can_be_played_again(wrap):
+    tasks = [Own(actions=MIXED if wrap is readable else PLAIN) for _ in range(2)]
     env, other = (
-        TransformedEnv(
-            GymWrapper(readable(task), categorical_action_encoding=True), EpisodeReplay()
-        )
+        TransformedEnv(GymWrapper(wrap(task), categorical_action_encoding=True), EpisodeReplay())
         for task in tasks
     )
     env.rollout(3)
     other.load_state_dict(env.state_dict())
-    played, again = (spaces.flatten(MIXED, task.action) for task in tasks)
+    played, again = (spaces.flatten(task.action_space, task.action) for task in tasks)
     assert played.tolist() == again.tolist()

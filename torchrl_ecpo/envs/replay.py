@@ -39,7 +39,8 @@ class EpisodeReplay(Transform):
     the tensordict that the caller holds.
 
     Raises:
-        TypeError: if it is not on one task of gymnasium or dm_control, or behind a transform that
+        TypeError: if it is not on one task of gymnasium or dm_control (`num_envs` are several), or
+            behind a transform that
             steps by itself.
         ValueError: for the state of another environment.
 
@@ -76,9 +77,13 @@ class EpisodeReplay(Transform):
         return tensordict_reset
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        action = tensordict["action"]
-        parts = isinstance(action, TensorDictBase)
-        self._actions.append(action.to_dict() if parts else action.clone())
+        container: Any = self.container
+        keys = container.base_env.action_keys
+        if keys == ["action"]:  # quicker
+            self._actions.append(tensordict["action"].clone())
+        else:
+            taken = tensordict.select(*keys).clone().to_dict()
+            self._actions.append(taken["action"] if [*taken] == ["action"] else taken)
         return next_tensordict
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -105,9 +110,11 @@ class EpisodeReplay(Transform):
         if not is_begun:
             return
         env = self._task()
+        has_one = {*env.full_action_spec.keys()} == {"action"}
         step = env.reset()
         for action in state["actions"]:
-            step = env.step(TensorDict({**step, "action": action}))["next"]
+            taken = {"action": action} if has_one else action
+            step = env.step(TensorDict({**step, **taken}))["next"]
             step = step.exclude("reward")
         self._start, self._actions = state["start"], list(state["actions"])
 
@@ -126,10 +133,12 @@ class EpisodeReplay(Transform):
 
     def _task(self) -> Any:
         env = getattr(self.container, "base_env", None)
-        if not isinstance(env, (GymWrapper, DMControlWrapper)):
+        is_one = isinstance(env, (GymWrapper, DMControlWrapper))
+        if not is_one or env.batch_size:
+            batch = f" of batch size {tuple(env.batch_size)}" if is_one else ""
             raise TypeError(
                 "EpisodeReplay is a transform of one task of gymnasium or dm_control, got "
-                f"{type(env).__name__}. Put it on each copy: TransformedEnv(GymEnv(...), "
+                f"{type(env).__name__}{batch}. Put it on each copy: TransformedEnv(GymEnv(...), "
                 "EpisodeReplay())."
             )
         container: Any = self.container
