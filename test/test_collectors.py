@@ -34,6 +34,7 @@ from torchrl.envs import (
     RenameTransform,
     RewardSum,
     StepCounter,
+    TensorDictPrimer,
     TransformedEnv,
     VecNormV2,
 )
@@ -49,6 +50,7 @@ from torchrl.trainers import Trainer, UpdateWeights
 
 from torchrl_ecpo import ECPOLoss
 from torchrl_ecpo.collectors import (
+    SupervisedAsyncCollector,
     SupervisedSyncCollector,
     TrajectoryGroupCollector,
     shut_down,
@@ -290,6 +292,31 @@ def test_policies_may_keep_entries_of_their_own():
     assert mask.sum(-1).unique().numel() > 3
     assert (batch["count"].squeeze(-1) == time + 1)[mask].all()
     assert_close(batch["next", "reward"], batch["count"] + batch["left"])
+
+
+def add_memory(observation, memory):
+    return observation[..., :1] + memory, memory + 1
+
+
+@pytest.mark.parametrize("is_nested", [False, True])
+def test_a_memory_under_one_name_goes_on_and_is_not_recorded(is_nested):
+    """A loss would read it as that before the step, and it is that after it."""
+    primer = TensorDictPrimer(memory=Unbounded(1), default_value=0.0, expand_specs=True)
+    policy = TensorDictModule(add_memory, ["observation", "memory"], ["action", "memory"])
+    env = TransformedEnv(Countdown(), primer)
+    if is_nested:
+        env = TransformedEnv(env, StepCounter(), auto_unwrap=False)
+    batch = collect(env, policy)
+    mask = batch["collector", "mask"]
+    time = torch.arange(batch.shape[-1]).expand(mask.shape)
+    assert (batch["action"].squeeze(-1) == batch["left"].squeeze(-1) + time)[mask].all()
+    assert "memory" not in batch
+    # What the environment shows, here by a transform, is kept as it was acted on.
+    double = TensorDictModule(lambda x: 2 * x, ["again"], ["again"])
+    policy = TensorDictSequential(double, linear_policy())
+    env = TransformedEnv(Countdown(), RenameTransform(["left"], ["again"], create_copy=True))
+    batch = collect(env, policy)
+    assert (batch["again"] == 2 * batch["left"]).all()
 
 
 def test_what_a_policy_overwrites_is_what_it_acted_on():
@@ -651,6 +678,18 @@ def test_what_a_policy_may_not_return():
         collect(Countdown(), lambda tensordict: tensordict["observation"][..., :1])
 
 
+def test_a_group_may_have_a_dimension_of_one():
+    class Wide(Countdown):
+        def __init__(self):
+            super().__init__()
+            self.observation_spec["group"] = Unbounded((2, 3, 1), dtype=torch.int64)
+
+        def _observe(self, group, left, done):
+            return super()._observe(group.reshape(2, 3, 1), left, done)
+
+    check_batch(collect(Wide(), num_groups=4), 4, 3)
+
+
 def test_what_a_policy_foresees_is_not_what_it_is_shown():
     """The environment's own next observation counts, as in TorchRL's collector."""
     seen = []
@@ -778,6 +817,12 @@ def test_an_error_of_a_worker_that_cannot_travel_is_told():
     request = cloudpickle.dumps(({}, "start", make, 0))
     with pytest.raises(RuntimeError, match=r"Unlicensed: no licence: 3\nTraceback"):
         _serve(request)
+
+
+@pytest.mark.parametrize("kind", [SupervisedSyncCollector, SupervisedAsyncCollector])
+def test_frames_are_not_split(kind):
+    with pytest.raises(ValueError, match=r"split_trajs .* batch is flat .*got True.*MultiSyncColl"):
+        kind([partial(GymEnv, "Pendulum-v1")], frames_per_batch=8, split_trajs=True)
 
 
 @pytest.mark.usefixtures("forked_workers")

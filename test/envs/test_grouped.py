@@ -34,6 +34,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_ecpo.envs import (
     AlgorithmicEnv,
+    BanditEnv,
     EpisodeReplay,
     GroupedEnv,
     GroupIdAllocator,
@@ -318,12 +319,32 @@ def test_a_state_from_before_states_had_an_owner_is_taken():
     AlgorithmicEnv("copy").load_state_dict(state)
 
 
-def test_episodes_of_other_environments_are_not_replayed():
-    env = TransformedEnv(SerialEnv(2, cartpole), EpisodeReplay())
-    with pytest.raises(
-        TypeError, match=r"one task of gymnasium or dm_control, got SerialEnv\. Put"
-    ):
+@pytest.mark.parametrize(
+    ("make", "match"),
+    [
+        (lambda: SerialEnv(2, cartpole), r"got SerialEnv\. Put"),
+        (lambda: GymEnv("CartPole-v1", num_envs=2), r"got GymEnv of batch size \(2,\)\. Put"),
+    ],
+)
+def test_episodes_of_other_environments_are_not_replayed(make, match):
+    env = TransformedEnv(make(), EpisodeReplay(), auto_unwrap=True)
+    with pytest.raises(TypeError, match=rf"one task of gymnasium or dm_control, {match}"):
         env.reset()
+    env.close(raise_if_closed=False)
+
+
+def test_an_index_is_refused_where_one_hot_actions_are_read():
+    env = GroupedEnv(lambda: GymEnv("CartPole-v1"), num_groups=1, group_size=2)
+    start = env.reset()
+    with pytest.raises(ValueError, match=r"'action' of shape \(1, 2\),.*OneHot .*categorical_act"):
+        env.step(start.set("action", torch.zeros(1, 2, dtype=torch.int64)))
+
+
+@pytest.mark.parametrize("env", [AlgorithmicEnv("copy"), BanditEnv(num_actions=3)], ids=type)
+def test_a_seed_is_counted(env):
+    for seed in (-1, 0.5, "3"):
+        with pytest.raises(ValueError, match="seed must be an integer of at least 0"):
+            env.set_seed(seed)
 
 
 @pytest.mark.parametrize("nested", [False, True])

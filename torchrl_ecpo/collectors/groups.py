@@ -68,9 +68,14 @@ class TrajectoryGroupCollector(PlayerCollector):
       hands to its own next step then travel without passing through the environment.
 
     A batch keeps what the environment and the policy wrote at each step, with two exceptions. What
-    the policy hands to its own next step, ``("next", ...)`` such as the state of an LSTM, is left
-    out: a loss recomputes it from ``is_init``. Of the environment's ``("next", ...)``, by default
-    only reward and done flags stay (`compact_obs`).
+    the policy hands to its own next step is left out: ``("next", ...)``, such as the state of an
+    LSTM, and a memory that its keys name both as read and as written. A loss recomputes it from
+    ``is_init``: only modules with a recurrent mode can be evaluated again. Of the environment's
+    ``("next", ...)``, by default only reward and done flags stay (`compact_obs`).
+
+    Behind a policy, an exploration module (``EGreedyModule``, ``AdditiveGaussianModule``) changes
+    the action and not the log-probability, which stays that of the action before the noise: losses
+    over groups are wrong for such batches.
 
     Args:
         create_env_fn: the environment, or what makes it, of batch size `[*B, K]`; a list of makers

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor, nn
-from torchrl.data import MultiCategorical, NonTensor
+from torchrl.data import NonTensor
 from torchrl.envs import (
     Compose,
     EnvBase,
@@ -32,6 +32,7 @@ from torchrl.modules import (
 
 from torchrl_ecpo.checks import check_count, check_flag, check_keys, check_kind, described
 from torchrl_ecpo.collectors.workers import set_training
+from torchrl_ecpo.envs._groups import check_action_shape
 from torchrl_ecpo.groups import GROUP_KEY, MASK_KEY, TRAJECTORY_KEY
 from torchrl_ecpo.modules import record_latents
 
@@ -219,7 +220,8 @@ class GroupPlayer:
 
     def _check_groups(self, root: TensorDictBase) -> Tensor:
         group = root[self.group_key]
-        rows = group.reshape(-1, self.group_size) if group.shape == root.shape else None
+        is_laid_out = group.shape in (root.shape, (*root.shape, 1))
+        rows = group.reshape(-1, self.group_size) if is_laid_out else None
         if rows is None or (rows != rows[:, :1]).any() or len(rows[:, 0].unique()) < len(rows):
             raise ValueError(
                 f"After a reset, {self.group_key!r} must be one integer for each row, equal for "
@@ -247,18 +249,8 @@ class GroupPlayer:
             )
         for key, spec in self.env.full_action_spec.items(True, True):
             action = acted.get(key, None)
-            if action is not None and action.shape != spec.shape:
-                mend = (
-                    "It takes an index for each choice, as Independent(Categorical(...), 1) gives."
-                    if isinstance(spec, MultiCategorical)
-                    else "An index (Categorical) goes with "
-                    "GymEnv(..., categorical_action_encoding=True), OneHotCategorical with "
-                    "GymEnv(...)."
-                )
-                raise ValueError(
-                    f"The policy writes {key!r} of shape {tuple(action.shape)}, but the action of "
-                    f"the environment is {type(spec).__name__} of shape {tuple(spec.shape)}. {mend}"
-                )
+            if action is not None:
+                check_action_shape(key, action, spec)
 
     def _set_inputs(
         self, root: TensorDictBase, acted: TensorDictBase, places: tuple[Tensor, Tensor] | None
@@ -289,9 +281,15 @@ class GroupPlayer:
         observed = set(own.full_observation_spec.keys(True, True))
         observed -= set(own.full_state_spec.keys(True, True))
         carried = {own: key for key in handed if (own := unravel_key(key[1:])) not in observed}
-        dropped = self.exclude_keys | carried.keys()
         named = map(unravel_key, getattr(self.policy, "out_keys", self.env.action_keys))
         written -= handed | given.difference(named)
+        # A memory under one name: what is recorded would be that after the step, and what a loss
+        # reads there is that before it.
+        said = map(unravel_key, getattr(self.policy, "in_keys", None) or ())
+        primed = set(self.env.full_state_spec.keys(True, True))
+        others = set(self.env.full_observation_spec.keys(True, True)) - primed
+        memory = written.intersection(said) - others - {*self.env.action_keys}
+        dropped = self.exclude_keys | carried.keys() | memory
         read = given | written
         if self._read is not None:
             read = {key for key in read if _is_below(key, self._read)}

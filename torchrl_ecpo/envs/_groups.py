@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torchrl.data import Categorical, Composite, MultiCategorical, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_ecpo.checks import check_count, check_kind
@@ -41,7 +41,7 @@ class GroupIdAllocator:
         self._renew()
 
     def identify(self, *key: int) -> int:
-        """Return the id of a thing that has a key: the same whenever this process asks.
+        """Return the id of a thing that has a key: the same until :meth:`allocate` needs a prefix.
 
         It is a hash of 63 bits: a million of them collide with a probability of one in 20 million.
         """
@@ -101,6 +101,22 @@ def check_owner(state: Mapping[str, Any], own: str) -> None:
         raise ValueError(f"The state is of another environment: of {owner}, and this is {own}.")
 
 
+def check_action_shape(key: NestedKey, action: torch.Tensor, spec: TensorSpec) -> None:
+    """Refuse what is no action, such as an index where the environment reads one-hot."""
+    if action.shape == spec.shape:
+        return
+    mend = (
+        "It takes an index for each choice, as Independent(Categorical(...), 1) gives."
+        if isinstance(spec, MultiCategorical)
+        else "An index (Categorical) goes with GymEnv(..., categorical_action_encoding=True), "
+        "OneHotCategorical with GymEnv(...)."
+    )
+    raise ValueError(
+        f"The policy writes {key!r} of shape {tuple(action.shape)}, but the action of the "
+        f"environment is {type(spec).__name__} of shape {tuple(spec.shape)}. {mend}"
+    )
+
+
 def check_is_new(name: str, task: Any, others: list[Any]) -> None:
     """Refuse a copy that is one of the others, and note it."""
     if any(task is other for other in others):
@@ -143,6 +159,8 @@ class OneInstance(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         """Nothing to seed: `instance_seed` draws the instance, and an episode is not random."""
+        if seed is not None:
+            check_count("seed", seed, least=0)
 
 
 class SeededGroups(EnvBase):

@@ -485,6 +485,8 @@ class AlgorithmicEnv(EnvBase):
             self.register_buffer(name, value, persistent=False)
 
     def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            seed = check_count("seed", seed, least=0)
         self._queue.clear()
         if seed is None:
             self._queue.generator.seed()

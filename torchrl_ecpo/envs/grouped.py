@@ -12,7 +12,7 @@ from torchrl.data.utils import CloudpickleWrapper
 from torchrl.envs import EnvBase, GymWrapper, ParallelEnv, SerialEnv, TransformedEnv
 
 from torchrl_ecpo.checks import check_count, check_flag, check_group_size, check_real, get_entry
-from torchrl_ecpo.envs._groups import SeededGroups, check_is_new
+from torchrl_ecpo.envs._groups import SeededGroups, check_action_shape, check_is_new
 
 
 class GroupedEnv(SeededGroups):
@@ -33,7 +33,7 @@ class GroupedEnv(SeededGroups):
         create_env_fn: makes one copy, for example
             ``lambda: GymEnv("CartPole-v1", categorical_action_encoding=True)``; its batch size must
             be empty. Without ``categorical_action_encoding=True`` discrete actions are one-hot,
-            and the numbers of a ``Categorical`` policy are misread.
+            and the numbers of a ``Categorical`` policy are refused.
         num_groups: `G`.
         group_size: `K`, at least 2.
         parallel: whether each copy runs in a process of its own (``ParallelEnv``) instead of one
@@ -49,8 +49,8 @@ class GroupedEnv(SeededGroups):
     Raises:
         TypeError: if `create_env_fn` is no function, or makes no environment of TorchRL.
         ValueError: if `group_size` is below 2, `num_groups` below 1, or a copy has a batch size;
-            if `create_env_fn` returns one copy again and again; for a negative seed, and for the
-            state of another environment.
+            if `create_env_fn` returns one copy again and again; for a negative seed, for an action
+            of another shape, and for the state of another environment.
         RuntimeError: at a reset of everything, if the copies of a row do not start alike.
 
     Examples:
@@ -120,7 +120,9 @@ class GroupedEnv(SeededGroups):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         for key in self.action_keys:
-            check_real(key, get_entry(tensordict, key))
+            action = get_entry(tensordict, key)
+            check_real(key, action)
+            check_action_shape(key, action, self.full_action_spec[key])
         out = self.copies.step(tensordict.reshape(-1))["next"]
         return self._add_group(out.reshape(self.batch_size))
 

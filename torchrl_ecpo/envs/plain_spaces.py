@@ -24,7 +24,7 @@ def readable(env: gym.Env) -> gym.Env:
 
     - ``Discrete``, ``MultiDiscrete`` (one-hot), ``MultiBinary``, ``Text``, and ``Dict`` and
       ``Tuple`` of all these and of boxes, are flattened; so is a box of another shape. If all are
-      integers within bounds below 256, they are scaled to [0, 1].
+      integers within bounds below 256, they are scaled to [0, 1]. A vector of doubles stays one.
     - Bytes from 0 to 255 in two or three dimensions are pixels, ``[C, H, W]``.
     - What a MiniGrid task shows is flattened, and its mission too, by MiniGrid's
       ``FlatObsWrapper``, unless it is always the same.
