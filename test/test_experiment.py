@@ -264,6 +264,21 @@ def test_comparison_puts_the_runs_of_a_method_together(runs):
     assert "| urex | 1 | 30 | 1.000 | 2.000 | 2.000 |" in comparison.table()
 
 
+def test_a_run_that_has_solved_its_task_keeps_its_last_value(tmp_path):
+    """It would be averaged over its climb alone; one that was killed has nothing to keep."""
+    config = make_config(
+        loss={"name": "ecpo"}, total_trajectories=30, seed=0, stop_when={"metric": "return"}
+    )
+    with make_run(tmp_path / "0", config) as run:
+        run.log({"return": 1.0}, step=10)
+        run.log({"return": 9.0}, step=20)
+    steps, values = load_comparison([tmp_path / "0"], "return").curves["ecpo"]
+    assert (steps.tolist(), values.tolist()) == ([10, 20, 30], [[1, 9, 9]])
+    (tmp_path / "0/summary.json").unlink()
+    steps, values = load_comparison([tmp_path / "0"], "return").curves["ecpo"]
+    assert (steps.tolist(), values.tolist()) == ([10, 20], [[1, 9]])
+
+
 def test_comparison_ranks_methods_by_their_mean_over_the_run():
     steps, early, late = np.array([10.0, 20.0]), np.array([[4.0, 4.0]]), np.array([[0.0, 6.0]])
     rows = Comparison("return", {"late": (steps, late), "early": (steps, early)}).table()

@@ -242,6 +242,8 @@ def test_what_is_no_list_of_runs_is_refused(script, name, given):
         (["seeds=[0,0]"], "seeds must be a list of different integers"),
         (["stack=['seed=0,1','seed=1']"], "'seed=1' is there twice"),
         (["seeds=[0,1]", "stack=['seed=2']"], "seeds or stack, not both"),
+        (["stack=['seeds=[0,1]']"], r"stack: seeds=\[0,1\] is for all runs together, got it in"),
+        (["stack=['compile=true seed=1']"], "compile=true is for all runs together"),
         (["stack=['loss.tua=1']"], "no option loss.tua; the nearest one is loss.tau"),
         (["stack=['project_steps=0']"], "project_steps must be an integer >= 1, got 0"),
         (["stack=['env=copy','env=reverse']"], "must agree in env.name, got copy and reverse"),

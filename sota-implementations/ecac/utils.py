@@ -106,11 +106,22 @@ SHOWN = ("evaluation_return", "return", "entropy", "alpha", "tau", "tau_prime", 
 
 def check_config(config: DictConfig, options: Sequence[str] = ()) -> None:
     """Refuse options that do not go together."""
+    _check_actor(config.loss)
     with closing(make_environment(config, seed=config.seed)) as env:
         make_actor(config, env)
         has_pixels = not isinstance(_observation_size(env), int)
     if problems := [*_problems(config.loss, config.critic, has_pixels)]:
         raise ValueError("\n".join(problems))
+
+
+def _check_actor(loss: DictConfig) -> None:
+    kind = "deterministic" if loss.name in ("td3", "ddpg") else "tanh_gaussian"
+    kind = "categorical" if loss.name.startswith("discrete_") else kind
+    if not loss.actor.startswith(kind):
+        raise ValueError(
+            f"loss.actor={loss.actor} does not go with loss={loss.name}, whose policy is {kind}: "
+            "leave it out."
+        )
 
 
 def _problems(loss: DictConfig, critic: str, has_pixels: bool) -> Iterator[str]:

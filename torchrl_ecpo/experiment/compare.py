@@ -134,6 +134,8 @@ def load_comparison(
 ) -> Comparison:
     """Read runs and put the curves of each method on common steps.
 
+    A run that ended once it had solved its task (``stop_when``) keeps its last value.
+
     Args:
         runs: directories of runs.
         metric: the column to compare; None: the first of ``evaluation_return``,
@@ -164,8 +166,8 @@ def load_comparison(
         measured = ~np.isnan(values)
         if not measured.any():
             raise ValueError(f"{run} has no value of {metric!r} yet: leave it out, or wait.")
-        values = smooth(values[measured], smoothing)
-        curves.setdefault(method, []).append(np.stack([steps[measured], values], axis=1))
+        curve = np.stack([steps[measured], smooth(values[measured], smoothing)], axis=1)
+        curves.setdefault(method, []).append(_extended(curve, run, config))
     for method, own in members.items():
         _check_alike(method, own)
     return Comparison(metric, {method: align(curves[method], method) for method in curves})
@@ -197,6 +199,16 @@ def align(curves: Sequence[np.ndarray], method: str) -> Curve:
     steps = steps[(first <= steps) & (steps <= last)]
     values = [c[np.searchsorted(c[:, 0], steps, side="right") - 1, 1] for c in curves]
     return steps, np.stack(values)
+
+
+def _extended(curve: np.ndarray, run: Path, config: Any) -> np.ndarray:
+    """With what a run that ended once it had solved its task (``stop_when``) kept until the end."""
+    total = next((config[name] for name in config if str(name).startswith("total_")), 0)
+    summary = run / "summary.json"
+    if not config.get("stop_when") or curve[-1, 0] >= total or not summary.is_file():
+        return curve
+    is_finished = json.loads(summary.read_text()).get("finished")
+    return np.vstack([curve, [total, curve[-1, 1]]]) if is_finished else curve
 
 
 def _config(run: Path) -> Any:

@@ -64,6 +64,12 @@ def check_command_line(script: str, check: Check | None = None) -> None:
         if not (flags.multirun or flags.help or "hydra.mode=MULTIRUN" in options):
             for line in [str(own.input_line) for own in parse(options) if own.is_sweep_override()]:
                 problems[f"{line} is several runs: add --multirun. A list is in brackets."] = None
+        for own in parse(options):
+            if own.key_or_group == "hydra.job.chdir" and own.value() is False:
+                problems[
+                    "hydra.job.chdir=false would write all runs to one directory, over each other. "
+                    "Leave it out."
+                ] = None
         for run in [options] if flags.help else expand(options):
             with _noting(problems):
                 config = compose_options(folder, run, name)

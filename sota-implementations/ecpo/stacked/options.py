@@ -14,6 +14,7 @@ from torchrl_ecpo.experiment.options import compose_options, expand, flatten, pa
 
 FOLDER = Path(__file__).parents[1]
 KINDS = ("algorithmic", "bandit")
+OF_ALL = ("seeds", "stack", "resume", "checkpoint", "compile", "threads", "hydra")
 MAY_DIFFER = (
     *("seed", "loss", "optim", "project_steps", "epochs", "max_kl"),
     *("anneal_from", "stop_when", "evaluation", "env.curriculum", "env.instance_seed"),
@@ -69,6 +70,13 @@ def _asked_for(config: DictConfig) -> list[list[str]]:
             f"null for a single run, got {stack!r}."
         )
     runs = [run for entry in stack for run in expand(shlex.split(entry))]
+    for run in runs:
+        for own in parse(run):
+            if own.key_or_group.split(".")[0] in OF_ALL:
+                raise ValueError(
+                    f"stack: {own.input_line} is for all runs together, got it in "
+                    f"{' '.join(run)!r}. Give it beside stack; several seeds of one are seed=0,1."
+                )
     twice = [" ".join(run) for run in runs if runs.count(run) > 1]
     if twice:
         raise ValueError(f"stack: {twice[0]!r} is there twice.")
