@@ -22,7 +22,7 @@ def importing(package: str, *modules: str) -> Callable[[str], Any]:
     def get(name: str) -> Any:
         here = vars(sys.modules[package])
         if name not in here["__all__"]:
-            if find_spec(f"{package}.{name}"):
+            if name.isidentifier() and find_spec(f"{package}.{name}"):
                 return import_module(f"{package}.{name}")
         else:
             for module in modules:

@@ -50,6 +50,8 @@ IMPLIED = {
     "max_kl": "None",
     "method.name": "ppo",
     "loss.width_entropy": 1.0,
+    "loss.min_tau": 0.001,
+    "loss.min_tau_prime": 0.003,
     "critic": "plain",
     # Of what is not learned, which had none.
     "optim.lr.log_tau": 0.01,

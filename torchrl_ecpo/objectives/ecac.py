@@ -66,7 +66,8 @@ class ECACLoss(ActorCriticLoss):
             parameter ``log_tau_prime``), as SAC's alpha is; ``"auto"`` (default, SAC's) is -A.
             None: tau_prime is fixed, or scheduled by assignment. It must be below the log-volume of
             the bounds of the actions.
-        min_tau: floor of a learned tau. Default: 0.001.
+        min_tau: floor of a learned tau, in the unit of Q: lower both floors where rewards are rare.
+            Default: 0.001.
         min_tau_prime: floor of a learned tau_prime. Without one it winds down to nothing while
             the policy lags behind its target. Default: 0.003.
         projection: ``"centred"`` (default): the scale is fitted to the variance about the samples'
