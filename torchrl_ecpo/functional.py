@@ -476,7 +476,7 @@ def centred_gaussian_projection(
     each, one = log_weights.shape, log_weights.select(dim, 0).shape
     of_each = {"loc": (loc, one), "scale": (scale, one), "samples": (samples, each)}
     for name, (value, shape) in of_each.items():
-        _check_samples(**{name: value})
+        _check_samples(None, None, **{name: value})
         if value.shape[:-1] != shape or value.shape[-1:] != loc.shape[-1:]:
             raise ValueError(
                 f"{name} must have the shape {tuple(shape)} and an axis of A more, as "
@@ -603,7 +603,7 @@ def lifted_gaussian_moments(
     _check_samples(sample_dim, log_weights=log_weights)
     dim, each = sample_dim % log_weights.ndim, log_weights.shape
     for name, value in {"samples": samples, "slope": slope}.items():
-        _check_samples(**{name: value})
+        _check_samples(None, None, **{name: value})
         if value.shape[:-1] != each or value.shape != samples.shape:
             raise ValueError(
                 f"{name} must have the shape {tuple(each)} of log_weights and an axis of A more, "
