@@ -62,7 +62,7 @@ nitpick_ignore_regex = [
     ),
     (
         "py:(class|exc)",
-        "Actions|Axes|CheckpointError|EnvBase|HydraException|NestedKey|Tensor|TensorDictBase",
+        "Actions|Axes|CheckpointError|EnvBase|HydraException|NestedKey|Score|Tensor|TensorDictBase",
     ),
     ("py:class", r"torchrl_ecpo\..*\._.+"),  # what is private has no page
     ("py:class", r"torchrl_ecpo\.modules\.(histories|distinct)\..+"),  # nor have distinct pasts

@@ -287,7 +287,7 @@ def test_all_that_does_not_go_together_is_said(refusal):
         ("bandit seed=1", "ecpo.py: bandit cannot be read as NAME=VALUE: missing EQUAL at"),
         ("seed=1,2", "ecpo.py: seed=1,2 is several runs: add --multirun. A list is in brackets."),
         ("resume=nowhere", "ecpo.py: resume=nowhere: there is no such directory.\n"),
-        ("hydra.job.chdir=false", "ecpo.py: hydra.job.chdir=false would write all runs to one"),
+        ("hydra.job.chdir=false", "ecpo.py: hydra.job.chdir=false would write runs to the"),
         ("ecac loss=sac loss.actor=deterministic", "with loss=sac, whose policy is tanh_gaussian"),
         ("ecac loss=td3 loss.actor=tanh_gaussian", "with loss=td3, whose policy is deterministic"),
         (

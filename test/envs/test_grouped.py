@@ -2,15 +2,18 @@ from __future__ import annotations
 
 import gc
 import os
+import pickle
 import re
 import sys
 from functools import partial
+from threading import Lock
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 
 import gymnasium
 import numpy
 import pytest
 import torch
+from gymnasium.envs.classic_control import CartPoleEnv
 from tensordict import TensorDict
 from torch.testing import assert_close
 from torchrl.collectors import Collector
@@ -469,3 +472,18 @@ def test_ids_of_forked_processes_differ():
     assert int(os.read(reader, 100)) != int(allocator.allocate(1))
     os.close(reader)
     os.close(writer)
+
+
+class Locked(CartPoleEnv):
+    """A task that cannot be pickled."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lock = Lock()
+
+
+def test_copies_go_into_no_pickle():
+    env = GroupedEnv(lambda: GymWrapper(Locked()), num_groups=1, group_size=2)
+    assert pickle.loads(pickle.dumps(env)).reset()["observation"].shape == (1, 2, 4)
+    env.reset(seed=None)
+    env.close()

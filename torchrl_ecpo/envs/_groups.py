@@ -218,10 +218,10 @@ class SeededGroups(EnvBase):
         return seeds, ids
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        if "seed" in kwargs:
+        if (seed := kwargs.pop("seed", None)) is not None:
             raise TypeError(
                 "Groups are seeded by set_seed(...), from which the seeds of their episodes come; "
-                f"reset takes none, got seed={kwargs['seed']!r}."
+                f"reset takes none, got seed={seed!r}."
             )
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:

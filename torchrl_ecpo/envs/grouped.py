@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -89,7 +90,7 @@ class GroupedEnv(SeededGroups):
         batched = ParallelEnv if parallel else SerialEnv
         copies = batched(
             num_groups * group_size,
-            CloudpickleWrapper(partial(_make_copy, create_env_fn, None if parallel else [])),
+            CloudpickleWrapper(partial(_make_copy, create_env_fn, None if parallel else _Made())),
         )
         if copies.batch_size != (num_groups * group_size,):
             shape = tuple(copies.batch_size[1:])
@@ -140,18 +141,32 @@ class GroupedEnv(SeededGroups):
             self.copies.close(raise_if_closed=raise_if_closed)
 
 
-def _make_copy(create_env_fn: Callable[[], EnvBase], others: list[Any] | None) -> EnvBase:
-    """Make one, of another task than the others, which are None in a process of its own."""
+class _Made:
+    """The tasks that were made, none of which this keeps alive; a pickle has none."""
+
+    def __init__(self) -> None:
+        self.tasks: list[weakref.ref[Any]] = []
+
+    def __reduce__(self) -> tuple[type[_Made], tuple[()]]:
+        return _Made, ()
+
+    def add(self, task: Any) -> None:
+        check_is_new("create_env_fn", task, [known() for known in self.tasks])
+        self.tasks.append(weakref.ref(task))
+
+
+def _make_copy(create_env_fn: Callable[[], EnvBase], made: _Made | None) -> EnvBase:
+    """Make one, of another task than those made, which are None in a process of its own."""
     env = create_env_fn()
     if not isinstance(env, EnvBase):
         raise TypeError(
             "create_env_fn must make an environment of TorchRL (of gymnasium's: GymWrapper), got "
             f"{env!r}."
         )
-    if others is not None:
+    if made is not None:
         task: Any = _without_transforms(env)
         task = task.unwrapped if isinstance(task, GymWrapper) else task
-        check_is_new("create_env_fn", task, others)
+        made.add(task)
     return _SeededEnv(env, auto_unwrap=False)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from copy import deepcopy
 from functools import partial
 from multiprocessing.connection import wait
@@ -272,7 +273,9 @@ class _Copy(gym.Wrapper):
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         options = kwargs.pop("options", None)
         if options:  # gymnasium's vector environment makes an empty mapping
-            kwargs["options"] = deepcopy(options)  # the others are given them too
+            with suppress(TypeError):  # what cannot be copied is shared
+                options = deepcopy(options)  # the others are given them too
+            kwargs["options"] = options
         out: Any = self.env.reset(**kwargs)
         if not isinstance(out, tuple) or len(out) != 2:
             raise _broken(self, f"reset must return (observation, info), got {_told(out)}")

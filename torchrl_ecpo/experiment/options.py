@@ -67,8 +67,8 @@ def check_command_line(script: str, check: Check | None = None) -> None:
         for own in parse(options):
             if own.key_or_group == "hydra.job.chdir" and own.value() is False:
                 problems[
-                    "hydra.job.chdir=false would write all runs to one directory, over each other. "
-                    "Leave it out."
+                    "hydra.job.chdir=false would write runs to the working directory, over each "
+                    "other. Leave it out."
                 ] = None
         for run in [options] if flags.help else expand(options):
             with _noting(problems):

@@ -153,7 +153,8 @@ def latent_of(distribution: Distribution, action: Tensor, recorded: Tensor | Non
     if made.shape != action.shape:
         return recorded
     eps = max(torch.finfo(x.dtype).eps for x in (action, recorded))
-    scale = action.abs().amax(tuple(range(action.ndim - 1)))  # of each number of the action
+    num_batch_dims = action.ndim - len(distribution.event_shape)
+    scale = action.abs().amax(tuple(range(num_batch_dims)))  # of each number of the action
     is_same = (made - action).abs() <= 64 * eps * scale
     if recorded.shape != action.shape:  # as on a simplex, which has a number more
         is_same = is_same.all(-1, keepdim=True)

@@ -203,10 +203,10 @@ class OneHotLinear(nn.Linear):
                 f"classes: expected int64 [n, *] of {len(self.last)} integers in a row, one for "
                 f"each of num_classes, got {described(classes)}."
             )
-        check_integers("classes", classes)
-        classes = classes.flatten(1)
-        lowest = torch.full_like(self.last, -1)
-        if values_can_be_seen() and not torch.equal(classes.clamp(lowest, self.last), classes):
+        if classes.dtype != torch.bool:
+            check_integers("classes", classes)
+        classes = classes.flatten(1).long()
+        if values_can_be_seen() and ((classes < -1) | (classes > self.last)).any():
             raise ValueError(
                 f"classes: expected integers from -1 to {self.last.tolist()}, got values from "
                 f"{classes.amin(0).tolist()} to {classes.amax(0).tolist()}."

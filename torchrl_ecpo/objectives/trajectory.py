@@ -220,7 +220,7 @@ class TrajectoryGroupLoss(PolicyLoss):
     not, the sums over a trajectory's steps may be handed in as a trajectory of one step."""
 
     least_group: ClassVar[int] = 2
-    """Trajectories a group, at least: weights are relative to the others of the group."""
+    """How many trajectories a group has at least, as weights are relative to the others."""
 
     further_in_keys: Sequence[NestedKey] = ()
     """Entries that networks of the member's own read from ``groups.steps.inputs``."""
