@@ -96,7 +96,8 @@ def run_here(beside, monkeypatch):
         config = compose_options(SCRIPTS / script, options)
         directory.mkdir(exist_ok=True)
         monkeypatch.chdir(directory)
-        own = {"overrides": {"task": options}, "mode": None, "runtime": {"cwd": str(directory)}}
+        runtime = {"cwd": str(directory), "config_sources": []}
+        own = {"overrides": {"task": options}, "mode": None, "runtime": runtime}
         monkeypatch.setattr(HydraConfig.instance(), "cfg", OmegaConf.create({"hydra": own}))
         main(config)
 

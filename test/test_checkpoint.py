@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import pickle
 import shlex
@@ -34,6 +35,7 @@ from torchrl.envs import DMControlEnv, GymEnv, TransformedEnv
 from torchrl_ecpo import ECPOLoss
 from torchrl_ecpo.envs import EpisodeReplay
 from torchrl_ecpo.experiment import Checkpoints, Progress, Run
+from torchrl_ecpo.experiment import run as run_module
 from torchrl_ecpo.experiment._files import check_files, read_manifest, seal
 from torchrl_ecpo.experiment.checkpoint import _differences, run_directory
 
@@ -211,12 +213,10 @@ def change_record(directory):
 def test_what_cannot_be_resumed_is_refused(interrupted, start, spoil, options, message):
     if spoil is not None:
         spoil(interrupted)
-    is_seen_late = spoil in (cut_record, change_record)  # when config.yaml has been written
-    untouched = interrupted / ("checkpoints" if is_seen_late else "")
-    before = contents(untouched)
+    before = contents(interrupted)
     with pytest.raises((CheckpointError, ValueError), match=message):
         start(interrupted, *RUNS["bandit"], f"resume={interrupted}", *options)
-    assert contents(untouched) == before
+    assert contents(interrupted) == before
 
 
 @pytest.mark.parametrize("value", [np.mean([1, 2]), np.zeros(2), [{"a": np.int64(1)}]], ids=str)
@@ -232,12 +232,18 @@ def test_what_could_not_be_read_is_not_written(tmp_path, value):
     assert attach(tmp_path, "auto", net=torch.nn.Linear(1, 1)).step == 5
 
 
-def attach(directory, resume=None, keep=2, **parts):
+def attach(directory, resume=None, keep=2, total_frames=100, **parts):
     """Checkpoints of a run that the test itself is."""
     logger = {"backend": "csv", "project": "test", "wandb_mode": "offline"}
     options = {"interval": None, "max_share": 1, "keep": keep}
     config = OmegaConf.create(
-        {"seed": 0, "total_frames": 100, "resume": resume, "checkpoint": options, "logger": logger}
+        {
+            "seed": 0,
+            "total_frames": total_frames,
+            "resume": resume,
+            "checkpoint": options,
+            "logger": logger,
+        }
     )
     found = Checkpoints(config, directory)
     run = Run(
@@ -404,6 +410,53 @@ def test_options_in_which_the_same_run_may_differ():
     new = {"seed": 0, "compile": True, "resume": "auto", "checkpoint": None, "total_frames": 10}
     assert _differences(old, new) == []
     assert _differences(new, old) == ["total_frames was 10, is 9"]
+
+
+def test_a_summary_is_gone_once_its_run_goes_on(tmp_path):
+    """A run that is prolonged, and killed before its next row, has not finished."""
+    run = attach(tmp_path)
+    with run.run, run:
+        save(run, 5)
+    assert (tmp_path / "summary.json").exists()
+    resumed = attach(tmp_path, "auto", total_frames=200)
+    assert not (tmp_path / "summary.json").exists()
+    with resumed.run, resumed:
+        pass
+    assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 5
+
+
+def test_a_run_that_goes_on_with_other_versions_keeps_those_before(tmp_path, monkeypatch):
+    for resume, torch_version in ((None, "1"), ("auto", "1"), ("auto", "2"), ("auto", "1")):
+        made_with = {"torch": torch_version}
+        monkeypatch.setattr(run_module, "_versions", made_with.copy)
+        run = attach(tmp_path, resume)
+        if resume is None:
+            save(run, 5)
+    versions = json.loads((tmp_path / "versions.json").read_text())
+    assert versions == {"torch": "1", "earlier": [{"torch": "1"}, {"torch": "2"}]}
+    assert len((tmp_path / "command.txt").read_text().splitlines()) == 4
+    attach(tmp_path)
+    assert json.loads((tmp_path / "versions.json").read_text()) == {"torch": "1"}
+    assert len((tmp_path / "command.txt").read_text().splitlines()) == 1
+    assert not (tmp_path / "metrics.csv").exists()
+
+
+def test_a_worker_that_ends_by_the_same_signal_is_no_failure(tmp_path, capsys):
+    """A cluster sends SIGTERM to the whole group of processes."""
+    run = attach(tmp_path)
+    run.run.log({"return": 0.5}, 5)
+    run.progress.frames = 5
+
+    def stopped():
+        with run:
+            os.kill(os.getpid(), signal.SIGTERM)
+            raise ChildProcessError("A worker has died.")
+
+    with pytest.raises(SystemExit) as stop:
+        stopped()
+    assert stop.value.code == 128 + signal.SIGTERM
+    assert "Stopped by SIGTERM. Resume with: " in capsys.readouterr().out
+    assert [path.name for path in checkpoints(tmp_path)] == ["checkpoint-000000000005"]
 
 
 def test_a_second_signal_does_not_wait(tmp_path):

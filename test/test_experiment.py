@@ -66,7 +66,7 @@ def test_a_run_leaves_config_versions_metrics_summary_and_picture(tmp_path, caps
 def test_one_process_makes_a_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(run_module, "PATIENCE", 0)
-    main = leaving_nothing(lambda config: make_run(tmp_path, config).__exit__(None, None, None))
+    main = leaving_nothing(lambda config: make_run(tmp_path, config).begin())
     with (tmp_path / ".lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)  # as the other process
         with pytest.raises(SystemExit, match=f"{tmp_path} is in use: another process makes this"):
@@ -76,37 +76,52 @@ def test_one_process_makes_a_run(tmp_path, monkeypatch):
     assert (tmp_path / "config.yaml").exists()
 
 
-@pytest.mark.parametrize("error", [RuntimeError, ValueError])
-def test_a_run_that_fails_before_its_first_row_leaves_nothing(tmp_path, monkeypatch, error):
+@pytest.mark.parametrize(
+    ("error", "backend"),
+    [
+        (RuntimeError, "csv"),
+        (ValueError, "tensorboard"),
+        pytest.param(ValueError, "wandb", marks=pytest.mark.slow),
+    ],
+)
+def test_a_run_that_fails_before_its_first_row_leaves_nothing(
+    tmp_path, monkeypatch, error, backend
+):
     """Nor what a buffer on the disk has made; from its first row on it keeps all."""
+    monkeypatch.setenv("WANDB_SILENT", "true")
     (tmp_path / "mine").write_text("")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(run_module, "to_absolute_path", lambda path: tmp_path.parent / path)
 
     @leaving_nothing
     def main(config):
-        run = make_run(tmp_path, config)
-        (tmp_path / "replay_buffer").mkdir()
-        (tmp_path / "replay_buffer/0.memmap").write_text("")
-        if config.seed:
-            run.log({"return": 1.0}, step=10)
-        raise error("of the simulator")
+        with make_run(tmp_path, config) as run:
+            run.begin()
+            (tmp_path / "replay_buffer").mkdir()
+            (tmp_path / "replay_buffer/0.memmap").write_text("")
+            if config.seed:
+                run.log({"return": 1.0}, step=10)
+            raise error("of the simulator")
 
     for seed, left in ((0, {"mine"}), (1, {"mine", "config.yaml", "metrics.csv", "replay_buffer"})):
         with pytest.raises(error, match="of the simulator"):
-            main(make_config(seed=seed))
+            main(make_config(backend, seed=seed))
         assert left <= {path.name for path in tmp_path.iterdir()}
         assert seed or left == {path.name for path in tmp_path.iterdir()}
 
 
-def test_a_summary_is_of_the_last_run_or_none(tmp_path):
-    """One that goes on beyond its end, and is killed, must not look finished."""
+def test_a_run_that_begins_removes_what_is_there_of_another(tmp_path):
     with make_run(tmp_path) as run:
         record(run)
-    longer = make_run(tmp_path)
-    assert (tmp_path / "summary.json").exists()
-    longer.log({"return": 1.0}, step=40)
-    assert not (tmp_path / "summary.json").exists()
+    other = make_run(tmp_path, make_config(mine=1))
+    assert {"summary.json", "curve.png"} < {path.name for path in tmp_path.iterdir()}
+    assert "mine" not in OmegaConf.load(tmp_path / "config.yaml")
+    other.begin()
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"config.yaml", "versions.json", "command.txt"}
+    assert OmegaConf.load(tmp_path / "config.yaml").mine == 1
+    other.log({"return": 1.0}, step=40)
+    assert read_metrics(tmp_path)["step"] == [40]
 
 
 def test_an_interrupted_run_keeps_its_record_and_says_so(tmp_path):
@@ -150,6 +165,12 @@ def test_runs_of_one_process_have_wandb_runs_of_their_own(tmp_path, monkeypatch)
         record(one)
         record(other)
     assert [len(list(folder.rglob("*.wandb"))) for folder in folders] == [1, 1]
+    with make_run(folders[0], make_config("wandb")) as resumed:
+        resumed.load_state_dict(one.state_dict())
+        resumed.log({"return": 1.0}, step=40)
+    parts = [path.stem for path in folders[0].rglob("*.wandb")]
+    assert len(parts) == 2
+    assert len({*parts}) == 1, "a run that goes on is the same one for W&B"
 
 
 def test_a_folder_without_a_record_is_refused(tmp_path):

@@ -69,7 +69,8 @@ LIFTS = ("form=paper", "seed=5", "project_steps=3")  # the form gives UREX, MENT
 def sweep(tmp_path_factory):
     """Some losses, by one start of the script."""
     directory = tmp_path_factory.mktemp("sweep")
-    where = (f"hydra.sweep.dir={directory}", "hydra.sweep.subdir=${loss.name}")
+    (directory / "mine").mkdir()
+    where = (f"hydra.sweep.dir={directory}", "hydra.sweep.subdir=${loss.name}", "--config-dir=mine")
     run_ecpo(directory, "--multirun", f"loss={','.join(SWEPT)}", *LIFTS, *where)
     return directory
 
@@ -82,7 +83,8 @@ def test_a_sweep_leaves_a_directory_for_each_run(sweep, loss):
     assert OmegaConf.load(run / "config.yaml").loss.name == loss
     assert (run / "curve.png").exists()
     command = (run / "command.txt").read_text()
-    assert command == f"python {ECPO} {' '.join([*TINY, f'loss={loss}', *LIFTS])}\n"
+    options = [f"--config-dir={sweep / 'mine'}", *TINY, f"loss={loss}", *LIFTS]
+    assert command == f"python {ECPO} {' '.join(options)}\n"
     commit = json.loads((run / "versions.json").read_text())["commit"]
     assert re.fullmatch(r"[0-9a-f]{40}(-dirty)?|unknown", commit)
     assert not list(run.glob("*.log"))

@@ -11,10 +11,12 @@ import torch
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from tensordict import TensorDict
+from torchrl.checkpoint import CheckpointError
 from torchrl.envs import GymEnv, InitTracker, TransformedEnv
 
 from torchrl_ecpo.envs import AlgorithmicEnv, BanditEnv
 from torchrl_ecpo.experiment import Checkpoints, Run, read_metrics
+from torchrl_ecpo.experiment._files import seal
 from torchrl_ecpo.modules import TupleCategorical, make_softmax_policy, make_tuple_policy
 from torchrl_ecpo.modules.histories import distinct_histories, hash_histories
 
@@ -176,9 +178,17 @@ def test_a_resumed_stack_goes_on_as_if_never_stopped(tmp_path, train, options):
     broken = tmp_path / "broken"
     with pytest.raises(SystemExit):
         train(broken, *options, stop_at=100)  # in the middle of a projection of ECPO on Copy
-    runs = [path.parent.name for path in (tmp_path / "whole").glob("*/metrics.csv")]
+    runs = sorted(path.parent.name for path in (tmp_path / "whole").glob("*/metrics.csv"))
     assert len(runs) == 2
     assert read_metrics(broken / runs[0])["step"][-1] == 100
+    (checkpoint,) = (broken / "checkpoints").iterdir()
+    before = (checkpoint / "manifest.json").read_text()
+    with (checkpoint / "manifest.json").open("w") as file:
+        file.write(before.replace('"epochs": 1', '"epochs": 2'))
+    seal(checkpoint)
+    with pytest.raises(CheckpointError, match=rf"runs\.{runs[0]}\.epochs was 2, is 1"):
+        train(broken, *options, f"resume={broken}")
+    (checkpoint / "manifest.json").write_text(before)
     train(broken, *options, f"resume={broken}")
     for run in runs:
         resumed, whole = read_metrics(broken / run), read_metrics(tmp_path / "whole" / run)

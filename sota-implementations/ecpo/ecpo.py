@@ -14,7 +14,7 @@ if __name__ == "__main__":  # before torch is imported, which takes seconds
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from stacked import check_runs, runs_of, train_stack
 from tasks import Metrics, make_task
 from torch.nn.utils import clip_grad_norm_
@@ -45,7 +45,8 @@ def main(config: DictConfig) -> None:
     torch.set_num_threads(config.threads)
     if config.seeds is not None or config.stack is not None:
         configs = runs_of(config, HydraConfig.get().overrides.task)
-        return train_stack(configs, Checkpoints(config))
+        whole = OmegaConf.create({**config, "runs": configs})  # as files of members may change
+        return train_stack(configs, Checkpoints(whole))
 
     checkpoints = Checkpoints(config)
     torch.manual_seed(config.seed)

@@ -63,8 +63,9 @@ class Record:
 
     @property
     def versions(self) -> dict[str, str]:
-        """Of the packages it was made with."""
-        return _read_json(self.path / "versions.json")
+        """Of the packages it was made with, at last."""
+        versions = _read_json(self.path / "versions.json")
+        return {name: value for name, value in versions.items() if name != "earlier"}
 
     @property
     def stopped_at(self) -> int | None:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from copy import deepcopy
 from pathlib import Path
 from types import FrameType, SimpleNamespace
-from typing import Any
+from typing import Any, NoReturn
 
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.utils import to_absolute_path
@@ -30,7 +30,7 @@ __all__ = ["Checkpoints", "Progress", "restore_part"]
 
 FOLDER = "checkpoints"
 # A run that differs in these alone is the same run.
-FREE_OPTIONS = ("resume", "checkpoint", "compile")
+FREE_OPTIONS = {"resume", "checkpoint", "compile"}
 # Useless once a run has finished, and most of its checkpoint.
 ONLY_TO_GO_ON = {"replay_buffer"}
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -165,6 +165,9 @@ class Checkpoints:
         else:
             self._load(self.source)
             self._saved_step = self.step
+        for part in (run, *self.parts.values()):
+            if isinstance(part, Run):
+                part.begin()
         self._saved_at, self._pause = time.monotonic(), 0.0
         return self
 
@@ -201,12 +204,15 @@ class Checkpoints:
         """
         if self._stopped_by is not None:
             self.save()
-            print(f"Stopped by {self._stopped_by.name}. Resume with: {self.command}")
-            raise SystemExit(128 + self._stopped_by)
+            self._leave(self._stopped_by)
         interval = self.options.interval
         waited = time.monotonic() - self._saved_at
         if interval is not None and waited >= max(interval, self._pause):
             self.save()
+
+    def _leave(self, stopped_by: signal.Signals) -> NoReturn:
+        print(f"Stopped by {stopped_by.name}. Resume with: {self.command}")
+        raise SystemExit(128 + stopped_by)
 
     def save(self, *, finished: bool = False) -> None:
         """Write a checkpoint, unless the last one is of the same step.
@@ -292,6 +298,9 @@ class Checkpoints:
                 self.save()
             except (FloatingPointError, CheckpointError) as refused:
                 print(refused, file=sys.stderr)
+        # A signal to the whole group of processes ends the workers too.
+        if isinstance(error, ChildProcessError) and self._stopped_by is not None:
+            self._leave(self._stopped_by)
 
 
 def _paths(folder: Path) -> list[Path]:
@@ -345,13 +354,17 @@ OmegaConf.register_new_resolver("run_directory", run_directory, replace=True)
 
 
 def _differences(saved: dict[str, Any], present: dict[str, Any]) -> list[str]:
-    """What differs in two configurations, but for `FREE_OPTIONS` and a total that has grown."""
+    """What differs in two configurations, of a run or a stack, but for what may differ."""
     old, new = (
-        flatten({name: value for name, value in config.items() if name not in FREE_OPTIONS})
+        {
+            name: value
+            for name, value in flatten(config).items()
+            if not {*name.split(".")} & FREE_OPTIONS
+        }
         for config in (saved, present)
     )
     for name in old.keys() & new.keys():
         # Nothing in a run depends on how long it is to be.
-        if name.startswith("total_") and float(old[name]) < float(new[name]):
+        if name.split(".")[-1].startswith("total_") and float(old[name]) < float(new[name]):
             old[name] = new[name]
     return list(differences(old, new).values())

@@ -19,6 +19,7 @@ from contextlib import suppress
 from functools import wraps
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 from filelock import BaseFileLock, FileLock, Timeout
@@ -42,7 +43,7 @@ METRICS_FILE = "metrics.csv"
 """Name of the record in the directory of a run."""
 LOCK = ".lock"
 PATIENCE = 5.0  # seconds that what a killed run has left behind may hold its lock
-BEGUN = {"config.yaml", "versions.json", "command.txt", "replay_buffer", LOCK}
+KEPT = {METRICS_FILE, "checkpoints"}  # what is worth keeping of a run that fails
 TOLD = (ValueError, LookupError, OSError, ImportError, CheckpointError)
 """Errors whose message is all that a user needs, if they come before a run has begun."""
 BACKENDS = ("csv", "tensorboard", "wandb")
@@ -202,9 +203,10 @@ def read_metrics(run_directory: Path | str) -> dict[str, list[float]]:
 class Run:
     """A training run in the current directory: record, loggers, progress bar, picture.
 
-    Writes ``config.yaml``, ``versions.json`` and ``command.txt``, ``metrics.csv`` as it goes, and
-    at the end ``summary.json`` and ``curve.png``, if any of ``shown`` was measured. Use it as a
-    context manager; a run that is interrupted keeps its record and still draws its picture.
+    Writes ``config.yaml``, ``versions.json`` and ``command.txt`` as it begins, ``metrics.csv`` as
+    it goes, and at the end ``summary.json`` and ``curve.png``, if any of ``shown`` was measured.
+    Use it as a context manager; a run that is interrupted keeps its record and still draws its
+    picture.
 
     Args:
         config: the composed configuration; needs ``seed`` and ``logger`` with ``backend``
@@ -249,18 +251,16 @@ class Run:
         stack_size: int = 1,
     ) -> None:
         check_choice("logger.backend", config.logger.backend, BACKENDS)
+        self.config = config
         self.name, self.unit, self.shown = name, unit, shown
         self.directory = Path(directory).resolve()
         self.stack_size = stack_size
         self.step = 0
-        self._latest: dict[str, float] = {}
-        # At once, as others read it while runs go on.
-        _write(self.directory / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
-        _write_json(self.directory / "versions.json", _versions())
-        with (self.directory / "command.txt").open("a" if config.get("resume") else "w") as file:
-            file.write(f"{shlex.join(command_line())}\n")
         self.table = MetricsTable(self.directory / METRICS_FILE)
-        self._logger = None if config.logger.backend == "csv" else self._make_logger(config)
+        self._latest: dict[str, float] = {}
+        self._logger: Logger | None = None
+        self._wandb_id = uuid4().hex[:8]
+        self._has_begun = self._is_resumed = False
         self._bar = tqdm(
             total=total,
             unit=f" {unit}",
@@ -271,12 +271,43 @@ class Run:
         )
         self._started = time.monotonic()
 
-    def _make_logger(self, config: DictConfig) -> Logger:
+    def begin(self) -> None:
+        """Write what the run is made with, open its logger, and remove what is not its own.
+
+        The first :meth:`log` does it, and ``Checkpoints.attach``, once all parts are where they
+        were. What is refused before that leaves a run that was here as it is.
+        """
+        if self._has_begun:
+            return
+        self._has_begun = True
+        (self.directory / "summary.json").unlink(missing_ok=True)  # that of a shorter run
+        if not self._is_resumed:
+            for name in (METRICS_FILE, "curve.png", "versions.json", "command.txt"):
+                (self.directory / name).unlink(missing_ok=True)
+        _write(self.directory / "config.yaml", OmegaConf.to_yaml(self.config, resolve=True))
+        self._write_versions()
+        with (self.directory / "command.txt").open("a") as file:
+            file.write(f"{shlex.join(command_line())}\n")
+        if self.config.logger.backend != "csv":
+            self._logger = self._make_logger()
+
+    def _write_versions(self) -> None:
+        """The present ones, and below ``earlier`` others with which the run was made before."""
+        path, versions = self.directory / "versions.json", _versions()
+        with suppress(FileNotFoundError, ValueError):
+            before = json.loads(path.read_text())
+            earlier = before.pop("earlier", []) + [before] * (before != versions)
+            versions |= {"earlier": earlier} if earlier else {}
+        _write_json(path, versions)
+
+    def _make_logger(self) -> Logger:
+        config = self.config
         logger = get_logger(
             config.logger.backend,
             logger_name=str(self.directory),
             experiment_name=self.name.replace("/", "_"),
             wandb_kwargs={
+                "id": self._wandb_id,
                 "project": config.logger.project,
                 "mode": config.logger.wandb_mode,
                 "reinit": "create_new",  # of stacked runs each has its own
@@ -294,8 +325,7 @@ class Run:
         """
         step = _as_step(step)
         values = {str(name): float(value) for name, value in metrics.items()}
-        # One that is there is of a shorter run before this one.
-        (self.directory / "summary.json").unlink(missing_ok=True)
+        self.begin()
         self.table.log_metrics(values, step)
         if self._logger is not None:
             self._logger.log_metrics(values, step)
@@ -330,6 +360,7 @@ class Run:
             "record": self.table.sha256,
             "latest": dict(self._latest),
             "seconds": seconds,
+            "wandb_id": self._wandb_id,
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -340,6 +371,8 @@ class Run:
         """
         self.table.cut_back(state_dict["step"], state_dict["record"])
         self.step, self._latest = state_dict["step"], dict(state_dict["latest"])
+        self._wandb_id = state_dict.get("wandb_id", self._wandb_id)
+        self._is_resumed = True
         self._started = time.monotonic() - state_dict["seconds"]
         self._bar.initial = self._bar.n = self.step
 
@@ -384,8 +417,12 @@ def _as_step(step: Any) -> Any:
 def command_line() -> list[str]:
     """What a user has typed; of a sweep, what starts this run alone."""
     is_typed = not HydraConfig.initialized() or HydraConfig.get().mode == RunMode.RUN
-    options = sys.argv[1:] if is_typed else HydraConfig.get().overrides.task
-    return ["python", sys.argv[0], *options]
+    if is_typed:
+        return ["python", sys.argv[0], *sys.argv[1:]]
+    hydra = HydraConfig.get()
+    given = [each.path for each in hydra.runtime.config_sources if each.provider == "command-line"]
+    folders = [f"--config-dir={path}" for path in given]
+    return ["python", sys.argv[0], *folders, *hydra.overrides.task]
 
 
 def leaving_nothing(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
@@ -452,14 +489,12 @@ def _present() -> set[Path]:
 
 
 def _clear(made: set[Path]) -> bool:
-    """Remove what a run has made, with its directory, unless there is more than how it begins."""
+    """Remove what a run has made, with its directory, unless it has a row or a checkpoint."""
     start, here = Path(to_absolute_path(".")), Path.cwd()
-    has_begun = any(
-        path.is_file() and path.relative_to(here).parts[0] not in BEGUN for path in made
-    )
+    has_begun = any(KEPT & {*path.relative_to(here).parts} for path in made)
     if not has_begun:
         for path in sorted(made, reverse=True):
-            path.unlink() if path.is_file() else path.rmdir()
+            path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
         for folder in (here, *here.parents):
             if folder == start or any(folder.iterdir()):
                 break
@@ -467,9 +502,9 @@ def _clear(made: set[Path]) -> bool:
     return has_begun
 
 
-def _versions() -> dict[str, str]:
-    versions = {"python": platform.python_version(), "platform": platform.platform()}
-    versions["commit"] = _commit()
+def _versions() -> dict[str, Any]:
+    versions: dict[str, Any] = {"python": platform.python_version(), "commit": _commit()}
+    versions["platform"] = platform.platform()
     for package in RECORDED_PACKAGES:
         try:
             versions[package] = importlib.metadata.version(package)
