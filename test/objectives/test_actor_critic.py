@@ -416,19 +416,17 @@ DEFAULTS = {
     "reduction": "mean",
     "loss_function": "l2",
     "num_qvalue_nets": 2,
-    "min_tau": 0.001,
-    "min_tau_prime": 0.003,
     "use_prioritized_weights": "auto",
 }
 OWN_DEFAULTS = {  # tau, tau_prime, then OWN
-    "ecac": (0.3, 1.0, 0.083, "auto", 8, 1, False),
-    "pmd_ac": (0.1, 1.0, None, "auto", 1, 1, True),
-    "mpo": (1.0, 0.0, None, None, 20, 20, True),
-    "discrete_ecac": (0.3, 0.1, 0.1, None, 8, 1, False),
-    "discrete_pmd_ac": (0.1, 0.1, None, None, 1, 1, True),
+    "ecac": (0.3, 1.0, 0.083, "auto", 8, 1, False, 1e-3, 3e-3),
+    "pmd_ac": (0.1, 1.0, None, "auto", 1, 1, True, 1e-3, 3e-3),
+    "mpo": (1.0, 0.0, None, None, 20, 20, True, 1e-3, 3e-3),
+    "discrete_ecac": (0.3, 0.1, 0.1, None, 8, 1, False, 1e-5, 1e-5),
+    "discrete_pmd_ac": (0.1, 0.1, None, None, 1, 1, True, 1e-3, 3e-3),
 }
 OWN = ("target_kl", "target_entropy", "num_action_samples", "num_next_action_samples")
-OWN = (*OWN, "delay_actor")
+OWN = (*OWN, "delay_actor", "min_tau", "min_tau_prime")
 
 
 @pytest.mark.parametrize("name", CASES)

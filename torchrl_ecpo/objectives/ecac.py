@@ -276,6 +276,8 @@ class DiscreteECACLoss(ECACLoss):
             ``DiscreteSACLoss``. Default: None, a fixed tau_prime. n is the number of actions that a
             mask leaves; other targets lie between 0 and its logarithm.
         target_entropy_weight: between 0 and 1. Default: 0.98, TorchRL's.
+        min_tau: default: 1e-5. Where rewards are rare, higher floors keep the policy random.
+        min_tau_prime: default: 1e-5.
 
     Raises:
         ValueError: as :class:`ECACLoss` and, when called, for a `target_entropy` that the actions
@@ -310,6 +312,8 @@ class DiscreteECACLoss(ECACLoss):
         target_kl: float | None = 0.1,
         target_entropy: float | Literal["auto"] | None = None,
         target_entropy_weight: float = 0.98,
+        min_tau: float = 1e-5,
+        min_tau_prime: float = 1e-5,
         projection: Literal["paper"] = "paper",
         **options: Any,
     ) -> None:
@@ -321,6 +325,8 @@ class DiscreteECACLoss(ECACLoss):
             tau_prime=tau_prime,
             target_kl=target_kl,
             target_entropy=target_entropy,
+            min_tau=min_tau,
+            min_tau_prime=min_tau_prime,
             projection=projection,
             **options,
         )
