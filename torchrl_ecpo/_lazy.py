@@ -10,7 +10,7 @@ from typing import Any
 
 
 def importing(package: str, *modules: str) -> Callable[[str], Any]:
-    """A package's ``__getattr__``: all its modules are imported with the first name asked for.
+    """A package's ``__getattr__``: its modules are imported with a public name that is asked for.
 
     Its other submodules are found too; any other name is none of its own, and imports nothing.
 

@@ -112,8 +112,8 @@ def check_action_shape(key: NestedKey, action: torch.Tensor, spec: TensorSpec) -
         "OneHotCategorical with GymEnv(...)."
     )
     raise ValueError(
-        f"The policy writes {key!r} of shape {tuple(action.shape)}, but the action of the "
-        f"environment is {type(spec).__name__} of shape {tuple(spec.shape)}. {mend}"
+        f"Got {key!r} of shape {tuple(action.shape)}, but the action of the environment is "
+        f"{type(spec).__name__} of shape {tuple(spec.shape)}. {mend}"
     )
 
 
