@@ -14,6 +14,7 @@ import os
 import re
 import signal
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -324,13 +325,23 @@ def test_seeds_are_stacked_and_what_has_begun_goes_on_as_it_was(study, run, tmp_
     assert stack.command[2:6] == ["name=one", "speed=1.0", "seeds=[1,3]", "total_frames=4"]
 
 
-def test_tasks_that_cannot_be_stacked_are_made_one_by_one(study, beside, tmp_path, counter):
-    add_option(counter, "seeds: null\nenv: {kind: gym}")
-    cells = study.manifest.read_manifests([plan(tmp_path, counter, s={})]).select()
+@pytest.mark.parametrize(
+    "given", ["env=frozenlake", "loss=trust_pcl", "collector=multi_sync", "compile=true", ""]
+)
+def test_runs_that_cannot_be_stacked_are_made_one_by_one(study, beside, tmp_path, given):
+    ecpo = STUDY.parent / "ecpo"
+    task = {"script": str(ecpo / "ecpo.py"), "options": given or "env=bandit"}
+    bare = {"methods": {"A": ""}}
+    path = plan(tmp_path, "", tasks={"one": task}, s=bare)
+    cells = study.manifest.read_manifests([path]).select()
     runs = study.run.planned_runs(cells, tmp_path, stack=2)
-    assert [each.seeds for each in runs] == [(1,), (2,)]
+    assert [each.seeds for each in runs] == ([(1,), (2,)] if given else [(1, 2)])
     beside("ecpo", "stacked")
-    assert beside("ecpo", "stacked.options").KINDS == study.run.STACKED_KINDS
+    stacked = beside("ecpo", "stacked.options")
+    assert stacked.KINDS == study.run.STACKED_KINDS
+    lines = [*cells[0].options, "seeds=[1,2]"]
+    with pytest.raises(ValueError, match=r"[Ss]tack") if given else nullcontext():
+        stacked.check_runs(options.compose_options(ecpo, lines), lines)
 
 
 @pytest.mark.slow  # real runs, of which the queue starts each in a new interpreter

@@ -31,7 +31,7 @@ from manifest import (
     changed_entries,
     read_manifests,
 )
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from records import Record, find_record
 from results import RESULTS, Results
 
@@ -121,15 +121,24 @@ def planned_runs(
                 by_seed[seed] = cell
     runs = []
     for base, by_seed in wanted.items():
-        config = next(iter(by_seed.values())).config
-        kind = OmegaConf.select(config, "env.kind")
-        size = stack if "seeds" in config and kind in STACKED_KINDS else 1
+        size = stack if can_be_stacked(next(iter(by_seed.values())).config) else 1
         for seeds in partition(list(by_seed), begun(base), size):
             longest = max((by_seed[s] for s in seeds if s in by_seed), key=lambda cell: cell.steps)
             name = "seed" if len(seeds) == 1 else "seeds"
             run = Run(longest, seeds, base / "_".join([name, *map(str, seeds)]), ignored)
             runs.append((min(list(by_seed).index(s) for s in seeds if s in by_seed), run))
     return [run for _, run in sorted(runs, key=lambda pair: pair[0])]
+
+
+def can_be_stacked(config: DictConfig) -> bool:
+    """Whether the script takes several runs that differ in the seed, as ecpo/stacked/ has it."""
+    return (
+        "seeds" in config
+        and OmegaConf.select(config, "env.kind") in STACKED_KINDS
+        and OmegaConf.select(config, "loss.class") != "TrustPCLLoss"  # which has a value network
+        and OmegaConf.select(config, "collector.backend", default="direct") == "direct"
+        and not config.get("compile")
+    )
 
 
 def without_results(
