@@ -187,6 +187,11 @@ def test_what_determines_no_number_of_a_run_is_not_its_identity(study):
     for stop_when in (None, goal):
         whole = OmegaConf.create({**config, "stop_when": stop_when})
         assert study.manifest.identity(whole) == {"epochs": 2, "seed": 1}
+    config = {"total_frames": 9, "seed": 1, "method": {"name": "ppo"}}
+    assert "total_frames" not in study.manifest.identity(OmegaConf.create(config))
+    for falling in ({"linear": ["clip_range"]}, {"method": {"name": "dqn"}}):
+        own = study.manifest.identity(OmegaConf.create({**config, **falling}))
+        assert own["total_frames"] == 9, "until the end something falls, whose slope it determines"
 
 
 @pytest.mark.slow
@@ -516,9 +521,15 @@ def test_runs_are_told_by_their_configuration_wherever_they_are(
 
 @pytest.mark.parametrize("has_goal", [True, False])
 def test_a_run_that_stopped_early_is_whole(study, tmp_path, counter, has_goal):
-    """It holds until the end what it held when it stopped; without a goal it is a part of a run."""
-    path = plan(tmp_path, counter, s={"steps": 200, "seeds": "1"})
-    (cell,) = study.manifest.read_manifests([path]).select()
+    """It holds until the end what it held when it stopped; without a goal it is a part of a run.
+
+    It is none of a cell with another goal.
+    """
+    add_option(counter, "stop_when: null")
+    goal = "stop_when={metric:return,at_least:3.0,batches:1}"
+    methods = {"A": "speed=1.0", "B": f"speed=1.0 {goal}"}
+    path = plan(tmp_path, counter, s={"steps": 200, "seeds": "1", "methods": methods})
+    cell, stopping = study.manifest.read_manifests([path]).select()
     directory = tmp_path / "runs/by_hand"
     directory.mkdir(parents=True)
     config = {**cell.config, "seed": 1, "total_frames": 200}
@@ -532,6 +543,11 @@ def test_a_run_that_stopped_early_is_whole(study, tmp_path, counter, has_goal):
     assert (record.finished, record.stopped_at, record.reached) == (
         (True, 100, 200) if has_goal else (False, None, 100)
     )
+    assert study.collect.is_of(stopping, record, [])
+    assert study.collect.is_of(cell, record, []) is not has_goal
+    assert study.collect.is_of(cell, record, ["stop_when"])
+    with pytest.raises(ValueError, match="stop_when was .*3.0") if has_goal else nullcontext():
+        assert not study.run.Run(cell, (1,), directory).is_done
     results = study.results.Results(tmp_path / "results/study/s")
     assert results.add(cell, record, ["return", "entropy"])
     results.write()
@@ -581,6 +597,20 @@ def test_longer_curves_take_the_place_of_shorter_ones_of_the_same_run(
     for entries, last in ((shorter, 100), (longer, 200), (shorter, 200)):
         results = collect(study, tmp_path, plan(tmp_path, counter, s=entries))
         assert results.curves["one", "A", "", 1][-1]["step"] == last
+
+
+def test_a_longer_run_is_none_of_a_cell_where_settings_fall_until_the_end(
+    study, run, tmp_path, counter, capfd
+):
+    add_option(counter, "linear: [speed]")
+    shorter, longer = ({"steps": steps, "seeds": "1"} for steps in (3, 4))
+    make_runs(run, plan(tmp_path, counter, s=longer))
+    assert collect(study, tmp_path, plan(tmp_path, counter, s=shorter)).runs == {}
+    assert run(plan(tmp_path, counter, s=shorter))[0] == 1
+    assert len(collect(study, tmp_path, plan(tmp_path, counter, s=longer)).runs) == 1
+    assert not study.results.Results.read(tmp_path / "results/study/s").has(
+        study.manifest.read_manifests([plan(tmp_path, counter, s=shorter)]).select()[0], 1
+    )
 
 
 def test_a_metric_that_the_study_also_shows_since_is_taken_in(study, run, tmp_path, counter):

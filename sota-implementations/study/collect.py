@@ -27,7 +27,7 @@ def is_of(cell: Cell, record: Record, ignored: Sequence[str]) -> bool:
     """Whether a run is one of a cell."""
     if record.seed not in cell.seeds or cell.total_option != f"total_{record.unit}":
         return False
-    return not changed_entries(record.identity, cell.identity(record.seed), ignored)
+    return not record.changes(cell, record.seed, ignored)
 
 
 def nearest(record: Record, cells: Iterable[Cell]) -> str:

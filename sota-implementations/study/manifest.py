@@ -144,7 +144,7 @@ class Cell:
     def identity(self, seed: int) -> dict[str, float | str]:
         """All that determines the numbers of a run."""
         config = self.config.copy()
-        config.seed = seed
+        config.seed, config[self.total_option] = seed, self.steps
         return identity(config)
 
     def directory(self, runs: Path) -> Path:
@@ -169,12 +169,18 @@ def total_option(config: DictConfig) -> str:
 
 
 def identity(config: DictConfig) -> dict[str, float | str]:
-    """The entries of a configuration that determine the numbers of a run, but for its length."""
+    """The entries of a configuration that determine the numbers of a run.
+
+    Its length is one of them where settings fall until its end: of ``sb3.py`` over frames.
+    """
     values = flatten(OmegaConf.to_container(config, resolve=True))
+    is_dqn = OmegaConf.select(config, "method.name") == "dqn"
+    falls = "total_frames" in config and bool(is_dqn or config.get("linear"))
     return {
         present(name): value
         for name, value in values.items()
-        if not _is_below(name, NOT_THE_RUN) and not name.split(".")[-1].startswith("total_")
+        if not _is_below(name, NOT_THE_RUN)
+        and (falls or not name.split(".")[-1].startswith("total_"))
     }
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from manifest import identity, total_option
+from manifest import Cell, changed_entries, identity, total_option
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_ecpo.experiment import read_metrics
@@ -33,6 +33,14 @@ class Record:
     def identity(self) -> dict[str, float | str]:
         """All that determines its numbers."""
         return identity(self.config)
+
+    def changes(self, cell: Cell, seed: int, ignored: Sequence[str] = ()) -> list[str]:
+        """What differs from a run of a cell, in words; the stop too, if it stopped early."""
+        changes = changed_entries(self.identity, cell.identity(seed), ignored)
+        old, new = self.config.get("stop_when"), cell.config.get("stop_when")
+        if self.stopped_at is not None and old != new and "stop_when" not in ignored:
+            changes.append(f"stop_when was {old}, is {new}")
+        return changes
 
     @property
     def seed(self) -> int:

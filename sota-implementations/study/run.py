@@ -28,7 +28,6 @@ from manifest import (
     add_ignored,
     add_selection,
     argument_parser,
-    changed_entries,
     read_manifests,
 )
 from omegaconf import DictConfig, OmegaConf
@@ -73,7 +72,7 @@ class Run:
         """
         records = self.records
         for seed, record in records.items():
-            changes = changed_entries(record.identity, self.cell.identity(seed), self.ignored)
+            changes = record.changes(self.cell, seed, self.ignored)
             if changes:
                 raise ValueError(
                     f"{self.directory} holds a run of another configuration: {'; '.join(changes)}. "
