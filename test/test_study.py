@@ -546,7 +546,7 @@ def test_a_run_that_stopped_early_is_whole(study, tmp_path, counter, has_goal):
     assert study.collect.is_of(stopping, record, [])
     assert study.collect.is_of(cell, record, []) is not has_goal
     assert study.collect.is_of(cell, record, ["stop_when"])
-    with pytest.raises(ValueError, match="stop_when was .*3.0") if has_goal else nullcontext():
+    with pytest.raises(ValueError, match=r"stop_when was .*3\.0") if has_goal else nullcontext():
         assert not study.run.Run(cell, (1,), directory).is_done
     results = study.results.Results(tmp_path / "results/study/s")
     assert results.add(cell, record, ["return", "entropy"])
@@ -588,15 +588,14 @@ def test_results_stay_unless_a_run_went_further_or_the_cell_has_changed(
     assert "results of one/A are dropped, for speed was 1.0, is 2.0" in capfd.readouterr().out
 
 
-def test_longer_curves_take_the_place_of_shorter_ones_of_the_same_run(
-    study, run, tmp_path, counter
-):
+def test_curves_of_the_same_run_follow_the_length_of_their_cell(study, run, tmp_path, counter):
     shorter, longer = ({"steps": steps, "seeds": "1"} for steps in (100, 200))
     make_runs(run, plan(tmp_path, counter, s=longer))
-    # Taken once more as a shorter one it stays.
-    for entries, last in ((shorter, 100), (longer, 200), (shorter, 200)):
+    for entries, last in ((shorter, 100), (longer, 200), (shorter, 100)):
         results = collect(study, tmp_path, plan(tmp_path, counter, s=entries))
-        assert results.curves["one", "A", "", 1][-1]["step"] == last
+        curve = results.curves["one", "A", "", 1]
+        assert (len(curve), curve[-1]["step"]) == (100, last)
+        assert collect(study, tmp_path, plan(tmp_path, counter, s=entries)) == results
 
 
 def test_a_longer_run_is_none_of_a_cell_where_settings_fall_until_the_end(

@@ -69,7 +69,8 @@ class Results:
     ) -> bool:
         """Take a run in, unless one of the cell and seed is there that went as far.
 
-        One that went as far, and has more of the metrics, replaces it.
+        One that went as far replaces it if it has more of the metrics, or if the curve that is
+        there is that of a longer cell, and coarser.
 
         Runs of the cell that were made with another configuration are dropped, but for entries
         that are ignored.
@@ -85,9 +86,11 @@ class Results:
         key = (cell.task.name, cell.method, cell.label, record.seed)
         curve = thin(record.metrics, metrics, cell.steps)
         if key in self.runs:
-            further = min(record.reached, cell.steps) - recorded(self.runs[key])
+            old = self.runs[key]
+            further = min(record.reached, cell.steps) - min(recorded(old), cell.steps)
             has_more = _names(curve) > _names(self.curves.get(key, []))
-            if further < 0 or (further == 0 and not has_more):
+            is_finer = cell.steps < int(old["steps"])
+            if further < 0 or (further == 0 and not (has_more or is_finer)):
                 return False
         self.configs[cell.name] = config
         self.curves[key] = curve
