@@ -57,6 +57,13 @@ def test_a_run_has_rows_of_so_many_frames_and_ends_with_a_whole_one(tmp_path, op
     assert summary["frames"] == 800
 
 
+def test_frames_are_counted_where_a_step_of_all_copies_has_several_rows(tmp_path):
+    options = ("env=cartpole", "n_envs=8", "log_interval=3", "total_frames=30", "ppo.n_steps=16")
+    metrics, summary = run_sb3(tmp_path, *options)
+    assert metrics["step"] == [6, 15, 24, 30]  # after 8, 16, 24 and 32 frames
+    assert summary["frames"] == 30
+
+
 def test_a_row_in_which_no_episode_ends_has_no_return(tmp_path):
     options = ("env=acrobot", "method=dqn", "dqn.gradient_steps=1", "dqn.train_freq=64")
     metrics, _ = run_sb3(tmp_path, *options, "total_frames=800", "log_interval=400")
@@ -66,7 +73,7 @@ def test_a_row_in_which_no_episode_ends_has_no_return(tmp_path):
 
 def test_settings_that_fall_do_so(beside):
     sb3 = beside("sb3", "sb3")
-    model = sb3.make_model(compose_options(SB3.parent, ["env=cartpole"]), "frames")
+    model = sb3.make_model(compose_options(SB3.parent, ["env=cartpole"]))
     assert model.lr_schedule(1.0) == pytest.approx(1e-3)
     assert model.lr_schedule(0.0) == 0
     assert model.clip_range(0.5) == pytest.approx(0.1)
@@ -86,16 +93,20 @@ def test_options_are_checked_and_a_run_is_not_resumed(tmp_path):
     for options, message in (
         (["env.solved=true"], "env.solved must be a number"),
         (["stop_when={batches:0}"], "stop_when.batches must be an integer >= 1"),
+        (["env.max_steps=abc"], "env.max_steps must be an integer >= 1 or null, got 'abc'"),
     ):
         with pytest.raises(ValueError, match=message):
             compose_options(SB3.parent, options)
     for options, message in (
         ([f"resume={tmp_path}"], f"resume={tmp_path}: sb3.py writes no checkpoints"),
         (["env=frozenlake", "method=dqn"], "total_frames, which env.name=FrozenLake-v1 has not"),
+        (["env=acrobot", "method=dqn", "env.name=Pendulum-v1"], "whose actions are Box: take"),
+        (["env.name=Nothing-v0"], "env.name=Nothing-v0 is no task of gymnasium"),
     ):
         process = run_script(tmp_path, SB3, *options)
         assert process.returncode != 0
         assert message in process.stderr
+        assert "Traceback" not in process.stderr
 
 
 def test_the_deep_sea_is_the_one_of_the_groups(beside):

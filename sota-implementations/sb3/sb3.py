@@ -10,6 +10,8 @@ anew.
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
+from contextlib import closing
 from functools import partial
 from typing import Any
 
@@ -108,14 +110,14 @@ class Record(BaseCallback):
         ends = [info["episode"] for info in self.locals["infos"] if "episode" in info]
         self.episodes += [(end["r"], end["l"]) for end in ends]
         interval, stop = self.config.log_interval, self.config.stop_when
-        if self.unit == "frames":
-            is_due, rows = self.num_timesteps >= self.run.step + interval, len(self.episodes)
+        if self.unit == "frames":  # of which a step has one for each copy, perhaps several rows
+            whole, rows = (self.num_timesteps - self.run.step) // interval, len(self.episodes)
         else:
-            is_due, rows = len(self.episodes) >= interval, interval
-        if is_due:
+            whole, rows = int(len(self.episodes) >= interval), interval
+        if whole:
             metrics = self.measured(self.episodes[:rows])
             del self.episodes[:rows]
-            self.run.log(metrics, step=self.run.step + interval)
+            self.run.log(metrics, step=self.run.step + whole * interval)
             is_gone = metrics.get("entropy", np.inf) < LEAST_ENTROPY
             self.held = self.held + 1 if is_gone else 0
         is_over = stop is not None and self.held >= stop.batches
@@ -143,14 +145,27 @@ def make_env(config: DictConfig) -> gym.Env:
     return Monitor(open_task(own.name, max_episode_steps=own.max_steps))
 
 
-def make_model(config: DictConfig, unit: str) -> BaseAlgorithm:
-    """The method, with its settings of this task."""
-    name = config.method.name
-    if name == "dqn" and unit != "frames":
+def check_config(config: DictConfig, options: Sequence[str] = ()) -> None:
+    """Refuse a task that cannot be made, and one that does not go with DQN."""
+    with closing(make_env(config)) as env:
+        actions = env.action_space
+    if config.method.name != "dqn":
+        return
+    if "total_frames" not in config:
         raise ValueError(
             "method=dqn explores less and less over total_frames, which env.name="
             f"{config.env.name} has not: take a task that counts frames, or method=ppo."
         )
+    if not isinstance(actions, gym.spaces.Discrete):
+        raise ValueError(
+            f"method=dqn chooses one of several actions, got env.name={config.env.name}, whose "
+            f"actions are {type(actions).__name__}: take method=ppo."
+        )
+
+
+def make_model(config: DictConfig) -> BaseAlgorithm:
+    """The method, with its settings of this task."""
+    name = config.method.name
     envs: Any = DummyVecEnv([partial(make_env, config)] * config.n_envs)
     settings: Any = OmegaConf.to_container(config[name], resolve=True)
     if config.normalize:
@@ -170,7 +185,7 @@ def main(config: DictConfig) -> None:
     refuse_resume(config)
     torch.set_num_threads(1)
     unit = "frames" if "total_frames" in config else "trajectories"
-    model = make_model(config, unit)
+    model = make_model(config)
     total = config[f"total_{unit}"]
     run = Run(
         config,
@@ -186,4 +201,5 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
+    check_command_line(__file__, check_config)
     main()
