@@ -180,6 +180,8 @@ def test_a_model_of_ones_own(modules, monkeypatch, tmp_path):
         ("loss=trl", "loss= is here ecpo or pmd or tpo or grpo, got trl"),
         ("group_size=1", "group_size must be an integer >= 2, got 1."),
         ("evaluation.completions=8", "evaluation.completions must be an integer >= 64, got 8."),
+        ("model.hidden_size=10", "model.hidden_size must be a multiple of 8, .* got 10."),
+        ("model.hidden_size=12", "model.hidden_size must be a multiple of 8, .* got 12."),
         ("model.path=nowhere", r"model.path=nowhere: it must be a directory with a model in \*."),
         (
             "model.path=no_tokenizer",

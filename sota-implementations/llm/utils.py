@@ -34,6 +34,11 @@ def check_run(config: DictConfig, losses: Collection[str]) -> None:
     if config.loss.name not in losses:
         raise ValueError(f"loss= is here {' or '.join(losses)}, got {config.loss.name}.")
     if (path := config.model.path) is None:
+        if (size := config.model.hidden_size) % 8:
+            raise ValueError(
+                "model.hidden_size must be a multiple of 8, for four heads of an even size, got "
+                f"{size}."
+            )
         return
     if not all(map(list, map(Path(path).glob, ("*.safetensors", "tokenizer_config.json")))):
         raise ValueError(
