@@ -297,6 +297,7 @@ def test_a_game_of_minatar_and_fewer_updates_than_frames(tmp_path, train):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
+        (["env=pendulum", "env.name=Ant-v5"], "env.name=Ant-v5: the runs would be named pendulum"),
         (["env=gym", "env.name=Chess-v0"], "env.name=Chess-v0 is no task of gymnasium"),
         (["env=gym", "env.name=CartPole-v1"], "loss=ecac does not go with env.name=CartPole-v1.*"),
         (["env=pendulum", "loss=discrete_ecac"], "loss=discrete_ecac does not go with"),
@@ -320,7 +321,7 @@ def test_a_game_of_minatar_and_fewer_updates_than_frames(tmp_path, train):
 def test_bad_options_end_with_a_clear_message(utils, overrides, message):
     config = configure([*tiny(overrides), *overrides])
     with pytest.raises(ValueError, match=message):  # noqa: PT012 - the script's first steps
-        utils.check_config(config)
+        utils.check_config(config, overrides)
         env = utils.make_environment(config, seed=0)
         loss_module = utils.make_loss(config, utils.make_actor(config, env), env)
         utils.make_optimizer(config.optim, loss_module)

@@ -60,6 +60,7 @@ from torchrl_ecpo.envs import EpisodeReplay
 from torchrl_ecpo.experiment import compile_module
 from torchrl_ecpo.experiment._tasks import missing, wrap_task
 from torchrl_ecpo.experiment._videos import greedy_episodes, save_gif, with_pixels
+from torchrl_ecpo.experiment.options import parse
 from torchrl_ecpo.modules import (
     make_action_value_network,
     make_categorical_actor,
@@ -106,6 +107,12 @@ SHOWN = ("evaluation_return", "return", "entropy", "alpha", "tau", "tau_prime", 
 
 def check_config(config: DictConfig, options: Sequence[str] = ()) -> None:
     """Refuse options that do not go together."""
+    given, env = {own.key_or_group for own in parse(options)}, config.env
+    if "env.name" in given and "env.title" not in given and env.name not in env.title:
+        raise ValueError(
+            f"env.name={env.name}: the runs would be named {env.title} still. Take env=gym, whose "
+            "runs are named after the task, or give env.title too."
+        )
     _check_actor(config.loss)
     with closing(make_environment(config, seed=config.seed)) as env:
         make_actor(config, env)
