@@ -60,11 +60,16 @@ def measure(size: int, repeats: int) -> tuple[float, ...]:
     batch = make_groups(10**9, NUM_GROUPS * GROUP_SIZE * MEAN_LENGTH)
     storage, count = buffer.storage, NUM_GROUPS * GROUP_SIZE
 
-    def write_and_draw() -> None:
+    def write_groups() -> None:
+        batch["group"] += NUM_GROUPS  # ids are unique: those of a batch before are other groups
+        batch["collector", "traj_ids"] += count
         buffer.extend(batch)
+
+    def write_and_draw() -> None:
+        write_groups()
         sampler.sample(storage, count)
 
-    write = milliseconds(lambda: buffer.extend(batch), repeats)
+    write = milliseconds(write_groups, repeats)
     first = milliseconds(write_and_draw, repeats)
     draw = milliseconds(lambda: sampler.sample(storage, count), repeats)
     sample = milliseconds(buffer.sample, repeats)
