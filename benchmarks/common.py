@@ -13,6 +13,8 @@ import torch
 def read_arguments(doc: str | None, **defaults: object) -> argparse.Namespace:
     """Options of a benchmark, of the types of their defaults, and `--csv PATH`; one thread.
 
+    A count must be at least 1, as there is no median of none.
+
     Args:
         doc: of the benchmark; its first line is the help.
         defaults: of the options; one whose default is a list takes several values.
@@ -29,7 +31,11 @@ def read_arguments(doc: str | None, **defaults: object) -> argparse.Namespace:
             parser.add_argument(option, type=type(default), default=default, help=f"{default}")
     parser.add_argument("--csv", type=Path, metavar="PATH", help="also write the table here")
     torch.set_num_threads(1)
-    return parser.parse_args()
+    arguments = parser.parse_args()
+    for name, value in vars(arguments).items():
+        if type(value) is int and value < 1:
+            parser.error(f"--{name.replace('_', '-')} must be at least 1, got {value}")
+    return arguments
 
 
 def write_csv(path: Path | None, rows: Iterable[Mapping[str, object]]) -> None:

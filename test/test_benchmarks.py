@@ -39,6 +39,13 @@ def test_all_are_listed() -> None:
     assert scripts == {*SHORTEST, "common", "sbx_loop"}
 
 
+def test_a_count_of_none_is_refused(tmp_path: Path) -> None:
+    result = run_script(tmp_path, BENCHMARKS / "sampler.py", "--repeats", "0")
+    assert result.returncode == 2
+    assert "--repeats must be at least 1, got 0" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHORTEST)
 def test_benchmark(name: str, tmp_path: Path) -> None:
