@@ -16,7 +16,12 @@ from torchrl_ecpo.experiment import MetricsTable, Run, leaving_nothing, read_met
 from torchrl_ecpo.experiment import run as run_module
 from torchrl_ecpo.experiment.compare import Comparison, final, find_runs, load_comparison
 from torchrl_ecpo.experiment.compare import main as compare
-from torchrl_ecpo.experiment.figures import draw_curve, plot_comparison, plot_learning_curve
+from torchrl_ecpo.experiment.figures import (
+    draw_curve,
+    plot_comparison,
+    plot_learning_curve,
+    save_figure,
+)
 
 PNG = b"\x89PNG\r\n"
 
@@ -367,6 +372,17 @@ def test_compare_takes_a_summary_that_was_cut_off_for_none(runs, capsys):
 def test_the_end_of_a_run_that_has_only_begun_is_its_first_row():
     values = np.array([[2.0], [4.0]])
     assert final(np.array([0]), values).tolist() == [2, 4]
+
+
+def test_a_picture_that_cannot_be_written_leaves_no_part(tmp_path, monkeypatch):
+    def savefig(figure, path, **options):
+        path.write_bytes(PNG)
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(Figure, "savefig", savefig)
+    with pytest.raises(OSError, match="No space left"):
+        save_figure(Figure(), tmp_path / "picture.png")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_curve_of_one_point_is_seen():

@@ -245,5 +245,8 @@ def symbols(text: str) -> str:
 def save_figure(figure: Figure, path: Path) -> Path:
     """Write a picture that depends on what it shows alone, without the date; return ``path``."""
     part = path.with_name(f".part-{path.name}")  # so that nobody sees a part if it is killed
-    figure.savefig(part, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
-    return part.replace(path)
+    try:
+        figure.savefig(part, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
+        return part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
