@@ -149,7 +149,9 @@ class Cell:
 
     def directory(self, runs: Path) -> Path:
         """Where the queue makes its runs; cells that are the same share it."""
-        return runs / self.task.name / re.sub(r"[^\w.,+~-]+", "-", ",".join(self.options))
+        length = [f"{self.total_option}={self.steps}"] * (self.total_option in self.identity(0))
+        name = re.sub(r"[^\w.,+~-]+", "-", ",".join([*self.options, *length]))
+        return runs / self.task.name / name
 
 
 @cache
