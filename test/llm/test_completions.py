@@ -204,6 +204,16 @@ def test_without_a_mask_all_tokens_count(model):
     assert loss_module._read(batch).num_steps.tolist() == lengths
 
 
+def test_a_completion_without_a_token_is_refused(model):
+    """Its reward would count for nothing; a mask may leave it out."""
+    actor, batch = make(model)
+    batch[3][FULL] = batch[3][PROMPT]
+    batch[3]["masks", "all_attention_mask"] = torch.ones(len(PROMPTS[3]), dtype=torch.bool)
+    batch[3][RECORDED] = torch.zeros(len(PROMPTS[3]))
+    with pytest.raises(ValueError, match=r"1 completion\(s\) have no token after the prompt"):
+        RLOOLoss(actor)(batch)
+
+
 def test_rewards_of_tokens_are_added_up(model):
     actor, batch = make(model)
     for i, row in enumerate(batch.unbind(0)):
@@ -423,6 +433,10 @@ def test_a_model_that_the_wrapper_calls_wrongly():
     sampler = tiny.make_sampler(model)
     with pytest.raises(ValueError, match=message):
         check_sampler(sampler)
+    with pytest.raises(ValueError, match=message):
+        RLOOLoss(tiny.make_actor(model))
+    with pytest.raises(TypeError, match=r"Wrap a language model: TransformersWrapper\(model"):
+        RLOOLoss(model)
 
 
 def test_a_compiled_model_is_looked_into():
@@ -470,7 +484,7 @@ def no_response(batch):
 BAD = {
     "pad_before_the_end": (pad_before_the_end, ValueError, "padding token before the end"),
     "other_prompt": (other_prompt, ValueError, "does not begin with"),
-    "no_response": (no_response, ValueError, "fewer than two trajectories"),
+    "no_response": (no_response, ValueError, "6 completion.* no token after the prompt"),
     "no_log_probs": (lambda b: b.exclude(RECORDED, inplace=True), KeyError, "record_log_probs"),
     "no_prompt": (lambda b: b.exclude(PROMPT, inplace=True), KeyError, "all_assistant_mask"),
     "no_reward": (lambda b: b.exclude(REWARD, inplace=True), KeyError, "'reward'"),

@@ -86,6 +86,8 @@ def check_actor(actor: Any) -> None:
             "The actor packs the rows into one (pad_model_input=False), where TorchRL's mask lets "
             "tokens see those after them. Leave out pad_model_input."
         )
+    if hasattr(getattr(actor, "model", None), "generation_config"):
+        _check_arguments(actor.model)
     _check_settings(_settings(actor))
 
 
@@ -141,7 +143,8 @@ def _check_arguments(model: Any) -> None:
         raise ValueError(
             f"{type(model).__name__}.forward takes {named[0]} where TorchRL's wrapper passes the "
             "attention mask, second. Take a model that has its mask there, as Llama, Qwen, OPT and "
-            "GPT-NeoX have it."
+            "GPT-NeoX have it, or call it in an actor of your own, as for samples of your own "
+            "(documentation, tutorials/own_samples)."
         )
 
 
@@ -285,6 +288,12 @@ def read_completions(
     returns = _returns(rows, reward_key, (actor.tokens_key, "prompt"), attention)
     if mask_key == "auto":
         mask = attention & _after_prompt(rows, tokens, tokens_key, (actor.tokens_key, "prompt"))
+        if values_can_be_seen() and not mask.any(-1).all():
+            raise ValueError(
+                f"{int((~mask.any(-1)).sum())} completion(s) have no token after the prompt, and "
+                "their rewards would count for nothing. Keep the token that ends a completion, or "
+                "leave such rows out by a mask, loss_module.loss_mask_key."
+            )
     elif mask_key is None:
         mask = attention
     else:
@@ -459,7 +468,8 @@ def _recorded(recorded: Tensor, key: NestedKey, log_prob: Tensor, mask: Tensor) 
     if recorded.shape != mask.shape:
         raise ValueError(
             f"The log-probabilities {key!r} must have the shape {tuple(mask.shape)} of the tokens, "
-            f"got {tuple(recorded.shape)}. {anew}"
+            f"got {tuple(recorded.shape)}. Of the completions alone, pad them on the left: "
+            f"torch.nn.functional.pad(log_probs, (prompt_length, 0)). {anew}"
         )
     if torch.finfo(recorded.dtype).bits < 32:
         raise ValueError(
@@ -488,5 +498,5 @@ def _check_dropout(actor: Any) -> None:
             raise ValueError(
                 f"The actor's {name!r} drops out {rate:.0%} of its units, so that its "
                 "log-probabilities are not those of the policy that sampled. Call model.eval(), "
-                "or build the model without dropout."
+                "or build the model without dropout, as where a trainer calls train() itself."
             )

@@ -75,9 +75,14 @@ class PolicyLoss(LossModule):
         self._out_keys: list[Any] | None = None
         super().__init__()
         if not hasattr(actor_network, "get_dist"):
+            wrapped = (
+                " Wrap a language model: TransformersWrapper(model, generate=False, tokenizer=..., "
+                "input_mode='tokens', pad_output=True)."
+            )
             raise TypeError(
                 "actor_network must have a get_dist method, as ProbabilisticActor and "
                 f"ProbabilisticTensorDictSequential have; got {type(actor_network).__name__}."
+                f"{wrapped * hasattr(actor_network, 'generate')}"
             )
         self.reduction = "mean" if reduction is None else reduction
         check_choice("reduction", self.reduction, REDUCTIONS)
