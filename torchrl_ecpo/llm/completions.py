@@ -498,5 +498,5 @@ def _check_dropout(actor: Any) -> None:
             raise ValueError(
                 f"The actor's {name!r} drops out {rate:.0%} of its units, so that its "
                 "log-probabilities are not those of the policy that sampled. Call model.eval(), "
-                "or build the model without dropout, as where a trainer calls train() itself."
+                "or build the model without dropout, where a trainer calls train() itself."
             )
