@@ -424,7 +424,7 @@ def test_an_index_is_refused_where_one_hot_actions_are_read():
         return_log_prob=True,
     )
     collector = TrajectoryGroupCollector(env, actor, num_groups=2, group_size=3)
-    message = r"writes 'action' of shape \(2, 3\).*is OneHot of shape \(2, 3, 2\)"
+    message = r"Got 'action' of shape \(2, 3\).*is OneHot of shape \(2, 3, 2\)"
     with shut_down(collector), pytest.raises(ValueError, match=message):
         next(iter(collector))
 
