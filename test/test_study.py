@@ -546,6 +546,7 @@ def test_a_run_that_stopped_early_is_whole(study, tmp_path, counter, has_goal):
     assert study.collect.is_of(stopping, record, [])
     assert study.collect.is_of(cell, record, []) is not has_goal
     assert study.collect.is_of(cell, record, ["stop_when"])
+    assert ("but stop_when was" in study.collect.nearest(record, [cell])) is has_goal
     with pytest.raises(ValueError, match=r"stop_when was .*3\.0") if has_goal else nullcontext():
         assert not study.run.Run(cell, (1,), directory).is_done
     results = study.results.Results(tmp_path / "results/study/s")

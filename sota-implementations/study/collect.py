@@ -40,6 +40,7 @@ def nearest(record: Record, cells: Iterable[Cell]) -> str:
     if not compared:
         return "no cell is of its script"
     changes, cell = min(compared, key=lambda pair: len(pair[0]))
+    changes = changes or record.changes(cell, record.seed)
     changes = changes or [f"seed {record.seed} is not among the planned"]
     return f"nearest is {cell.name}, but {'; '.join(changes)}"
 

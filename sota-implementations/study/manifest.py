@@ -149,7 +149,7 @@ class Cell:
 
     def directory(self, runs: Path) -> Path:
         """Where the queue makes its runs; cells that are the same share it."""
-        length = [f"{self.total_option}={self.steps}"] * (self.total_option in self.identity(0))
+        length = [f"{self.total_option}={self.steps}"] * length_counts(self.config)
         name = re.sub(r"[^\w.,+~-]+", "-", ",".join([*self.options, *length]))
         return runs / self.task.name / name
 
@@ -171,19 +171,21 @@ def total_option(config: DictConfig) -> str:
 
 
 def identity(config: DictConfig) -> dict[str, float | str]:
-    """The entries of a configuration that determine the numbers of a run.
-
-    Its length is one of them where settings fall until its end: of ``sb3.py`` over frames.
-    """
+    """The entries of a configuration that determine the numbers of a run."""
     values = flatten(OmegaConf.to_container(config, resolve=True))
-    is_dqn = OmegaConf.select(config, "method.name") == "dqn"
-    falls = "total_frames" in config and bool(is_dqn or config.get("linear"))
+    with_length = length_counts(config)
     return {
         present(name): value
         for name, value in values.items()
         if not _is_below(name, NOT_THE_RUN)
-        and (falls or not name.split(".")[-1].startswith("total_"))
+        and (with_length or not name.split(".")[-1].startswith("total_"))
     }
+
+
+def length_counts(config: DictConfig) -> bool:
+    """Whether settings fall until the end of a run, as those of ``sb3.py`` over frames may."""
+    is_dqn = OmegaConf.select(config, "method.name") == "dqn"
+    return "total_frames" in config and bool(is_dqn or config.get("linear"))
 
 
 def changed_entries(

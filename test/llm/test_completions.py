@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
@@ -210,8 +211,17 @@ def test_a_completion_without_a_token_is_refused(model):
     batch[3][FULL] = batch[3][PROMPT]
     batch[3]["masks", "all_attention_mask"] = torch.ones(len(PROMPTS[3]), dtype=torch.bool)
     batch[3][RECORDED] = torch.zeros(len(PROMPTS[3]))
+    loss_module = RLOOLoss(actor)
     with pytest.raises(ValueError, match=r"1 completion\(s\) have no token after the prompt"):
-        RLOOLoss(actor)(batch)
+        loss_module(batch)
+    loss_module.loss_mask_key = "own"
+    for left_out, message in ((3,), None), ((1, 3), "leaves 1 group.* fewer than two trajectories"):
+        for i, row in enumerate(batch.unbind(0)):
+            after = torch.arange(len(row[FULL])) >= len(PROMPTS[i])
+            row["own"] = after & (i not in left_out)
+        with pytest.raises(ValueError, match=message) if message else nullcontext():
+            means = [sum(REWARDS[i] for i in rows) / len(rows) for rows in ([0, 2, 5], [1, 4])]
+            assert loss_module(batch)["return"].item() == pytest.approx(sum(means) / 2)
 
 
 def test_rewards_of_tokens_are_added_up(model):
